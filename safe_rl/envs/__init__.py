@@ -1,6 +1,6 @@
 """Environments of every family, the contract they fulfil, and their names.
 
-Names and keys are imported at once, what builds environments when it is used first.
+Names and keys are imported at once. Modules that build environments are imported at first use.
 """
 
 from typing import TYPE_CHECKING

@@ -1,6 +1,6 @@
 """The contract of a batch of constrained environments.
 
-Training, evaluation and the command line use nothing else of an environment.
+Training, evaluation and the command line use only this part of an environment.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from torchrl.envs import EnvBase
 from safe_rl.envs.costs import COST
 from safe_rl.naming import key_name
 
-#: Continuous or integers within bounds, choices as integers, choices as one-hot vectors.
+#: Specs of actions: numbers within bounds, choices as integers, choices as one-hot vectors.
 ACTIONS = (Bounded, Categorical, OneHot)
 
 
 class ConstrainedEnv(EnvBase):
-    """N environments that are stepped together: an `EnvBase` of batch size [N], and more.
+    """A batch of N environments that are stepped together: an `EnvBase` of batch size [N].
 
-    It reads `action`: [N, A] bounded, or choices, [N] or [N, A] integers or [N, C] one-hot.
-    Continuous ones come as policies draw them, from about -1 to 1 at first: it cuts them to its
-    bounds. It writes `observation`, vectors of float32 or pictures, `reward` [N, 1], every one of
-    `cost_keys` [N, 1], 0 or more, `done`, `terminated` and `truncated`. Costs stand in the reward
-    spec.
+    It reads `action`: bounded numbers [N, A], or choices as integers [N] or [N, A], or as one-hot
+    vectors [N, C]. A policy may draw continuous actions outside the bounds (at first they are about
+    -1 to 1); the environment clips them. It writes `observation` (vectors of float32, or pictures),
+    `reward` [N, 1], each of `cost_keys` [N, 1] (0 or more), `done`, `terminated` and `truncated`.
+    The costs are part of the reward spec.
 
     Attributes:
-        cost_keys: Names of the costs; the aggregate `cost` is one of them. Every environment has
-            its own.
-        max_episode_steps: The largest number of steps of an episode. Every environment has its own.
-        observation_layout: Columns of every named component of a flat `observation`; a nested one
-            may say what its columns were if it were flat. Every environment has its own.
-        return_key: The entry below "next" that returns are made of.
-        seconds_per_step: What a step takes in the environment's own time [s]; None if unknown.
-        steps_per_decision: Steps of the environment that one call of `step` takes. If it is not 1,
-            `steps_taken` [N, 1], an integer, says how many a call has taken: fewer at an end.
-        steps_before: Steps of every row in the part of the run before this one.
-        render: Draws environments as `SimulatedEnv.render` does; None if there are no pictures.
+        cost_keys: Names of the costs; the aggregate `cost` is one of them. It has no default.
+        max_episode_steps: Largest number of steps of an episode. It has no default.
+        observation_layout: Columns of every named component of a flat `observation`. If the
+            observation is nested, the columns that it would have if it were flat. It has no
+            default.
+        return_key: Key below "next" of the rewards that returns are computed from.
+        seconds_per_step: Simulated time of a step [s]; None if unknown.
+        steps_per_decision: Environment steps that one call of `step` takes. If it is not 1, each
+            call writes their number to `steps_taken` [N, 1]: it is lower where an episode ends.
+        steps_before: Steps of every row in earlier parts of the run.
+        render: Method that draws pictures as `SimulatedEnv.render` does; None if there is none.
 
     Examples:
         >>> from safe_rl.envs import SafetyGymEnv
@@ -62,34 +62,37 @@ class ConstrainedEnv(EnvBase):
     def get_state(self) -> Any:
         """Return a copy of everything that determines what happens next, a TensorDict [N].
 
-        None, as here, if the worlds cannot be stored: a resumed run then begins new episodes.
+        None (the default) if it cannot be stored: a resumed run then begins new episodes.
         """
         return None
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
-        """Put the worlds into a state of `get_state`; returns what a reset returns."""
-        raise NotImplementedError(f"{type(self).__name__} cannot store its worlds.")
+        """Set the environments to a state from `get_state`; return what a reset returns."""
+        raise NotImplementedError(f"{type(self).__name__} cannot store its state.")
 
     def get_positions(self) -> TensorDictBase:
-        """Return where things are, a TensorDict [N] of [N, K, 3] by kind (m); here of nothing."""
+        """Return the positions of objects by kind, a TensorDict [N] of [N, K, 3] (m).
+
+        It is empty by default.
+        """
         return TensorDict(batch_size=self.batch_size)
 
     def highest_cost(self, key: str) -> float:
-        """Return the most that an episode can cost: its steps times the upper bound in the spec.
+        """Return the largest possible cost of an episode: calls of `step` times the spec's bound.
 
-        Infinite if the spec has no bound.
+        It is infinite if the spec has no bound.
         """
         spec = self.full_reward_spec[key]
         highest = float(spec.high.max()) if hasattr(spec, "high") else math.inf
-        # the largest number of a spec stands for no bound
+        # the largest number of the dtype stands for no bound
         is_bounded = highest < torch.finfo(torch.float32).max
         calls = self.max_episode_steps / self.steps_per_decision
         return highest * calls if is_bounded else math.inf
 
     def any_done(self, tensordict: TensorDictBase) -> bool:
-        """Whether an episode has ended; where, is written as `_reset`.
+        """Return whether any episode has ended, and write to `_reset` which ones.
 
-        As TorchRL's, which returns a tensor: the host would wait for a device a second time.
+        TorchRL's method returns a tensor, so that the host would wait for the device twice.
         """
         done = tensordict.get("done")
         if has_ended := bool(done.any()):
@@ -110,12 +113,16 @@ class ConstrainedEnv(EnvBase):
             ) from error
 
     def continue_from(self, steps: int) -> None:
-        """Continue schedules after so many steps of every row."""
+        """Continue schedules after a number of steps of every row."""
         self.steps_before = steps
 
 
 def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Add components to a layout, name -> number of columns, after its last column.
+    """Return a layout with further components after its last column.
+
+    Args:
+        layout: Name -> columns.
+        sizes: Name -> number of columns of each further component.
 
     Examples:
         >>> add_columns({"gyro": slice(0, 3)}, {"lidar": 16})
@@ -134,16 +141,16 @@ _DEFAULTS = (
 
 
 class ContractError(ValueError):
-    """An environment that does not fulfil the contract; the message lists what it lacks."""
+    """An environment does not fulfil the contract; the message lists what is missing."""
 
 
 def check_constrained_env(env: Any) -> None:
     """Check a custom environment against the contract, without stepping it.
 
-    TorchRL's `check_env_specs` finds out whether the specs are true.
+    TorchRL's `check_env_specs` steps it, and checks that the outputs agree with the specs.
 
     Raises:
-        ContractError: Naming everything that is missing or wrong.
+        ContractError: If anything is missing or wrong; the message lists all of it.
 
     Examples:
         >>> from torchrl.envs import PendulumEnv
@@ -155,15 +162,15 @@ def check_constrained_env(env: Any) -> None:
     """
     if not isinstance(env, EnvBase):
         raise ContractError(
-            f"{type(env).__name__} is no environment of TorchRL (EnvBase). Those of Gymnasium are "
-            "wrapped by `safe_rl.envs.from_gymnasium`."
+            f"{type(env).__name__} is not a TorchRL environment (EnvBase). To wrap a Gymnasium "
+            "environment, use `safe_rl.envs.from_gymnasium`."
         )
     problems = [*_shape_problems(env), *_cost_problems(env), *_layout_problems(env)]
     missing = [name for name in _DEFAULTS if not hasattr(env, name)]
     if missing:
         problems.append(
             f"it has no {', '.join(missing)}: derive it from safe_rl.envs.ConstrainedEnv, which "
-            "has defaults for them."
+            "has defaults."
         )
     if problems:
         lines = "".join(f"\n- {problem}" for problem in problems)

@@ -1,4 +1,4 @@
-"""Errors that say what to change, and the nearest right name for a wrong one."""
+"""Errors that say what to change, and suggestions for a misspelled name."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = [
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key and what to change."""
+    """A configuration cannot be used; the message names the key and what to change."""
 
 
 def on_cpu_only(key: str) -> str:
-    """Say that a family without MuJoCo Warp cannot have a key; an empty text for other keys.
+    """Return a hint that only Safety Gym has a key of MuJoCo Warp; an empty text for other keys.
 
     Examples:
         >>> on_cpu_only("frame_skip")
@@ -29,11 +29,11 @@ def on_cpu_only(key: str) -> str:
         return ""
     return (
         f" Only Safety Gym's environments have '{key}': the physics of all others, such as the "
-        "velocity family, runs on the CPU only. Leave it out, and preset=gpu, which sets 'physics'."
+        "velocity family, runs on the CPU only. Remove it, and preset=gpu, which sets 'physics'."
     )
 
 
 def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1) -> None:
-    """Raise ConfigError unless an argument is an integer between the bounds."""
+    """Raise ConfigError unless an argument is an integer from `lowest` to `highest`."""
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
         raise ConfigError(f"'{name}' must be an integer of at least {lowest}, got {value!r}.")

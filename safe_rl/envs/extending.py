@@ -1,8 +1,8 @@
-"""Adding to the vocabulary from outside the package: elements, tasks, costs, observations, robots.
+"""Registration of elements, tasks, costs, observations and robots from outside the package.
 
-Each function adds one row to the table of the built-in ones, and its configuration keys to the
-built-in keys, with the same checks. Registering a name again replaces the row, so that a notebook
-cell can run twice; environments that exist already do not change.
+Each function adds one row to the table of the built-in rows, and its configuration keys to the
+built-in keys, with the same checks. To register a name again replaces its row, so that a notebook
+cell can run twice. Environments that exist already do not change.
 """
 
 from __future__ import annotations
@@ -79,16 +79,15 @@ _BUILT_IN = {
 def register_element(element: Element, keys: Mapping[str, Any] | None = None) -> None:
     """Add a kind of object.
 
-    It comes with the configuration keys `<kind>_placements`, `<kind>_locations`, `<kind>_keepout`
-    and `<kind>_size`; with `<kind>_num`, unless it belongs to a task (a kind that is its own
-    label); with `observe_<kind>`, unless the row names another flag; with `<kind>_density` and
-    `<kind>_rots` if it can be pushed, and with `<kind>_travel` if it is guided. It is placed after
-    the built-in kinds.
+    It gets the configuration keys `<kind>_placements`, `<kind>_locations`, `<kind>_keepout` and
+    `<kind>_size`; also `<kind>_num`, unless it belongs to a task (kind and label are equal);
+    `observe_<kind>`, unless the row names another flag; `<kind>_density` and `<kind>_rots` if it
+    can be pushed; and `<kind>_travel` if it is guided. It is placed after the built-in kinds.
 
     Args:
         element: The row.
-        keys: Further keys with their defaults, and other defaults of the keys above. A default of
-            no clear type (None, an empty tuple) is given as `Key(default, annotation)`.
+        keys: Further keys with their defaults, and other defaults for the keys above. If the
+            default has no clear type (None, an empty tuple), give `Key(default, annotation)`.
 
     Raises:
         ConfigError: If the kind, its label or a key is taken, or a default cannot be used.
@@ -219,7 +218,7 @@ def _refuse_taken(what: str, name: str) -> None:
 
 def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
     if isinstance(kinds, str):
-        raise ConfigError(f"'{kinds}' is a text: kinds are given in a tuple, ('{kinds}',).")
+        raise ConfigError(f"'{kinds}' is a text: give the kinds in a tuple, ('{kinds}',).")
     for kind in kinds:
         if kind not in BY_KIND:
             raise ConfigError(
@@ -228,7 +227,7 @@ def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
 
 
 def _keys_of(element: Element) -> dict[str, Key]:
-    """Keys that every element of this sort has."""
+    """Return the keys that an element gets without being asked, see `register_element`."""
     keys = {
         "placements": Key(None, Placements),
         "locations": Key((), Locations),
@@ -246,7 +245,7 @@ def _keys_of(element: Element) -> dict[str, Key]:
 
 
 def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | None = None) -> None:
-    """Extend the vocabulary by standard keys and by those that were given, defaults or `Key`."""
+    """Register standard keys and the given ones, whose values are defaults or `Key`s."""
     keys = dict(standard or {})
     for name, value in (given or {}).items():
         if isinstance(value, Key):

@@ -1,11 +1,11 @@
 """The table of families: names of environments, nodes of the configuration, and their defaults.
 
 The key `_target_` of a node names its family: a function or class that is called with a mapping of
-the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without one is
-Safety Gym's. What builds environments is not imported here, so that start-up is quick.
+the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without it
+belongs to Safety Gym. Modules that build environments are not imported here, for a quick start.
 
-A configuration may come from somebody else: an `id` that makes a library import a module, or names
-a class that is not listed here, is refused. The user names such a module by `import=`.
+A configuration may come from an unknown source. So an `id` is refused if it makes a library import
+a module, or names a class that is not listed here. The user permits such a module by `import=`.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
 from safe_rl.ranges import Count, Text, values_of
 
-# MuJoCo's own library is installed; the default of these classes is another package.
+# These classes use another package by default; MuJoCo's own library is installed.
 _MUJOCO = {"backend": "mujoco", "parallel": False}
 TORCHRL_CLASSES: dict[str, Mapping[str, Any]] = {
     "PendulumEnv": {},
     "FinancialRegimeEnv": {},
     **dict.fromkeys(("AntEnv", "HopperEnv", "HumanoidEnv", "Walker2dEnv"), _MUJOCO),
 }
-"""Classes of `torchrl.envs` that need no `import=`, and the arguments that they get by default."""
+"""Classes of `torchrl.envs` that need no `import=`, and their default arguments."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +42,12 @@ class ForeignFamily:
 
     Attributes:
         target: `_target_` of its nodes.
-        title: What messages call one of its environments.
-        keys: Key -> its default, and an annotation that says what it may be. All have `id` and
-            `name`.
-        check: Checks the whole node, before an environment is made.
-        describe: "module:function" that returns the cost keys and the length of episodes of a node,
-            and finds out those that are None by making an environment.
+        title: Name of one of its environments in messages.
+        keys: Key -> its default, and an annotation of its allowed values. `id` and `name`, which
+            all families have, are not listed.
+        check: Checks the whole node before an environment is made.
+        describe: "module:function" that returns the cost keys and the length of episodes of a node.
+            If one of them is None, it makes an environment to find out.
     """
 
     target: str
@@ -58,7 +58,7 @@ class ForeignFamily:
 
 
 def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete a node: cost keys and the length of episodes are found out where they are None.
+    """Return a node with all keys; cost keys and length of episodes are determined if None.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
@@ -66,7 +66,7 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
     for key in node:
         if key not in (*family.keys, "id", "name", "_target_"):
             meant = nearest(str(key), [*family.keys, "id"])
-            others = " The environment's own arguments stand in 'kwargs': env.kwargs='{…}'."
+            others = " The environment's own arguments belong in 'kwargs': env.kwargs='{…}'."
             raise ConfigError(
                 f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant + others}"
             )
@@ -79,14 +79,14 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
             raise ConfigError(f"'{key}' must be {values.words}, got {full[key]!r}.")
     family.check(full)
     if None in (full["cost_keys"], full["num_steps"]):
-        # Imported here: making environments needs torch, and knowing their names does not.
+        # Imported here, because environments need torch and their names do not.
         module, _, function = family.describe.partition(":")
         full["cost_keys"], full["num_steps"] = getattr(import_module(module), function)(full)
     return full
 
 
 def hint_of_gymnasium(name: str) -> str:
-    """Say how to choose an environment by its Gymnasium id; an empty text for any other name."""
+    """Return a hint how to choose an environment by its Gymnasium id; empty for other names."""
     spec = gymnasium.registry.get(name)
     if spec is None or str(spec.entry_point).startswith("safe_rl."):
         return ""
@@ -95,10 +95,10 @@ def hint_of_gymnasium(name: str) -> str:
 
 def _check_gymnasium(node: Mapping[str, Any]) -> None:
     module, _, plain = node["id"].rpartition(":")
-    if module:  # which Gymnasium would import
+    if module:  # Gymnasium would import it
         raise ConfigError(
-            f"env.id={node['id']}: configurations import nothing. If you trust '{module}', use "
-            f"import={module} env.id={plain}"
+            f"env.id={node['id']}: a configuration cannot import a module. If you trust "
+            f"'{module}', use import={module} env.id={plain}"
         )
     parse_ranges(node.get("outside"))
 
@@ -108,9 +108,9 @@ def _check_torchrl(node: Mapping[str, Any]) -> None:
     if "." not in name and name not in TORCHRL_CLASSES:
         raise ConfigError(
             f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
-            f"{nearest(name, TORCHRL_CLASSES)} Any other class of TorchRL's comes with "
-            "import=torchrl.envs env.id=torchrl.envs.NAME, one of yours with import=my_module "
-            "env.id=my_module.NAME, and one of Gymnasium's by its id with env=gymnasium."
+            f"{nearest(name, TORCHRL_CLASSES)} For another class of TorchRL use "
+            "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
+            "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
         )
     parse_ranges(node["outside"])
 
@@ -147,7 +147,7 @@ TORCHRL = ForeignFamily(
 )
 
 GROUP = "env"
-"""Of configurations, in Hydra."""
+"""The group of environments in Hydra."""
 VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
 
 
@@ -155,7 +155,7 @@ def config_node(name: str, config: Any, target: str | None = None) -> dict[str, 
     """Return a configuration as a node of the group `env`: `name`, family, and every key.
 
     Args:
-        name: Of the environment.
+        name: Name of the environment.
         config: A `SafetyGymConfig` or a `VelocityConfig`.
         target: `_target_` of the family; None is Safety Gym's.
     """
@@ -164,14 +164,14 @@ def config_node(name: str, config: Any, target: str | None = None) -> dict[str, 
 
 
 def _plain(value: Any) -> Any:
-    """Turn tuples into lists: Hydra knows no tuples."""
+    """Turn tuples into lists, because Hydra has no tuples."""
     return [_plain(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _complete(
     resolve: Callable[[Mapping[str, Any]], Any], target: str | None, node: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Add the defaults of the keys that a node lacks; those it has stay as they are written."""
+    """Add the defaults of missing keys to a node; its own keys keep their values."""
     config = resolve({key: value for key, value in node.items() if key not in ("name", "_target_")})
     return {**config_node(node.get("name", "custom"), config, target), **node}
 
@@ -188,24 +188,24 @@ FAMILIES: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
         for foreign in (GYMNASIUM, TORCHRL, SAFETY_GYMNASIUM)
     },
 }
-"""`_target_` -> what fills up a node; nodes with any other are taken as they are."""
+"""`_target_` -> function that completes a node. A node with another target is used as it is."""
 
 _TARGETS = {name: target for target, suite in _SUITES.items() for name in suite}
 
 
 def env_names() -> list[str]:
-    """Names that stand for an environment of any family."""
+    """Return the names of the environments of all families, without stored ones."""
     return list(_TARGETS)
 
 
 def env_node(name: str) -> dict[str, Any]:
-    """Return the node of the group `env` that a name stands for; KeyError if there is none."""
+    """Return the node of the group `env` for a name; KeyError if there is none."""
     target = _TARGETS[name]
     return config_node(name, _SUITES[target][name], target)
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete a node that has only what differs from the defaults of its family.
+    """Complete a node that has only the keys that differ from the defaults of its family.
 
     Raises:
         ConfigError: For an unknown key or a value that cannot be used.
@@ -215,7 +215,7 @@ def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stored_node(name: str) -> dict[str, Any] | None:
-    """Return the node that was stored by a name, see `safe_rl.envs.store_config`; None without."""
+    """Return the node that `safe_rl.envs.store_config` stored by a name, or None."""
     held = _stored().get(f"{name}.yaml")
     if held is None:
         return None
@@ -224,11 +224,11 @@ def stored_node(name: str) -> dict[str, Any] | None:
 
 
 def known_names() -> list[str]:
-    """Names that `make_env` takes: those of every family, and what has been stored."""
+    """Return the names that `make_env` takes: those of all families, and the stored ones."""
     return [*env_names(), *(key.removesuffix(".yaml") for key in _stored())]
 
 
 def _stored() -> Mapping[str, Any]:
-    """What Hydra holds in its group of environments, by file name."""
+    """Return the nodes in Hydra's group of environments, by file name."""
     group = ConfigStore.instance().repo.get(GROUP, {})
     return {key: held for key, held in group.items() if key.endswith(".yaml")}

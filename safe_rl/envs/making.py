@@ -1,4 +1,4 @@
-"""From a name, or a node of the configuration, to a batch of environments of any family."""
+"""Make a batch of environments of any family from a name, or a node of the configuration."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ def make_env(
     """Make a batch of environments of any family.
 
     Args:
-        env: A name, also one that `store_config` has given; a configuration of Safety Gym; or a
-            node of the group `env`: `name`, `_target_` and the family's keys.
+        env: A name, also one from `store_config`; a configuration of Safety Gym; or a node of the
+            group `env`: `name`, `_target_` and the family's keys.
         num_envs: Number of environments, N.
-        device: Where the TensorDicts live.
-        seed: Determines every draw; None takes one from torch's generator.
-        num_threads: Threads that may step them; 0 for one per core.
+        device: Device of the TensorDicts.
+        seed: Determines every random draw; None takes a seed from torch's generator.
+        num_threads: Largest number of threads that step them; 0 for one per core.
         transforms: Name -> transform, or its node, as `transform_env` takes them.
-        evaluating: Whether the transforms undo what only serves learning.
+        evaluating: Whether transforms that only serve learning are undone.
 
     Raises:
         ConfigError: For an unknown name or key, or a value that cannot be used.
-        TargetError: For a family that configurations must not reach.
-        ContractError: For a family of the user's whose environments lack something.
+        TargetError: For a family whose target a configuration may not name.
+        ContractError: If an environment of the user's family does not fulfil the contract.
 
     Examples:
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
@@ -60,14 +60,14 @@ def make_env(
         check_constrained_env(made)
     if list(made.batch_size) != [num_envs]:
         raise ContractError(
-            f"{target} was asked for {num_envs} environments and made {made.batch_size[0]}: it "
-            "must make 'num_envs' of them."
+            f"{target} made {made.batch_size[0]} environments instead of {num_envs}: it must make "
+            "'num_envs' of them."
         )
     return made
 
 
 def _named(name: str) -> str | dict[str, Any]:
-    """A name's node; what the 2019 engine calls it is for its family to understand."""
+    """Return the node of a name; a name as in the 2019 engine is returned as it is."""
     if name in env_names():
         return env_node(name)
     stored = stored_node(name)
@@ -77,7 +77,7 @@ def _named(name: str) -> str | dict[str, Any]:
         resolve(name)
     except ConfigError:
         raise ConfigError(
-            f"Unknown environment '{name}'.{nearest(name, known_names())} A module of yours that "
-            "stores it by that name (store_config) has to be imported before."
+            f"Unknown environment '{name}'.{nearest(name, known_names())} If a module of yours "
+            "stores it by that name (store_config), import the module first."
         ) from None
     return name

@@ -1,7 +1,7 @@
-"""OpenGL, which only pictures need: it is chosen and loaded when the first one is drawn.
+"""OpenGL, which only pictures need: its backend is chosen and loaded for the first picture.
 
-MuJoCo loads the OpenGL backend that MUJOCO_GL names when it is imported, and fails where its
-libraries are missing. Importing this module imports MuJoCo in any case.
+At import, MuJoCo loads the OpenGL backend that MUJOCO_GL names, and fails if its libraries are
+missing. This module imports MuJoCo even then.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ try:
     import mujoco
 except ImportError:
     raise
-except Exception:  # whatever PyOpenGL raises in place of an ImportError
+except Exception:  # PyOpenGL raises various errors instead of an ImportError
     _backend = os.environ["MUJOCO_GL"]
     os.environ["MUJOCO_GL"] = "disable"
     import mujoco
@@ -22,7 +22,7 @@ except Exception:  # whatever PyOpenGL raises in place of an ImportError
     os.environ["MUJOCO_GL"] = _backend
 from mujoco.rendering.classic import gl_context
 
-# What Debian and Ubuntu call the libraries of each backend.
+# Packages of Debian and Ubuntu with the libraries of each backend.
 PACKAGES = {
     "egl": "libegl1 libgl1 libgl1-mesa-dri",
     "glfw": "libgl1 libgl1-mesa-dri",
@@ -41,8 +41,8 @@ def _has_screen() -> bool:
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """Open an OpenGL context that draws pictures of one size [pixels].
 
-    The backend is the one that MUJOCO_GL names, or EGL where there is neither that nor a screen.
-    The model's offscreen buffer is set to the size.
+    The backend is the one that MUJOCO_GL names. If the variable is not set and there is no screen,
+    it is EGL. The model's offscreen buffer is set to the size.
 
     Raises:
         OpenGLError: If OpenGL is missing or cannot be started.
@@ -61,7 +61,7 @@ def load_backend() -> None:
         os.environ["MUJOCO_GL"] = "egl"
     elif hasattr(gl_context, "GLContext"):
         return
-    # MuJoCo chooses by MUJOCO_GL when this module is loaded, and its Renderer looks there.
+    # When this module is loaded, it chooses by MUJOCO_GL; MuJoCo's Renderer uses its choice.
     importlib.reload(gl_context)
 
 

@@ -1,4 +1,4 @@
-"""Pictures of one compiled model, of any family: cameras, markers, renderers of every size."""
+"""Pictures of one compiled model of any family: cameras, markers, and renderers by size."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Camera: TypeAlias = str | mujoco.MjvCamera
 
 
 class Marker(NamedTuple):
-    """A shape that is drawn besides the model: MuJoCo type, size as in MJCF, centre [m], colour."""
+    """A shape that is not in the model: MuJoCo type, size as in MJCF, centre [m], colour."""
 
     type: mujoco.mjtGeom
     size: tuple[float, float, float]
@@ -28,7 +28,7 @@ class Marker(NamedTuple):
 
 
 class Pictures(ABC):
-    """Draws one model; nothing is compiled or opened before the first picture."""
+    """Draws one model. The model is compiled and OpenGL is opened for the first picture."""
 
     options: mujoco.MjvOption | None = None
 
@@ -41,26 +41,26 @@ class Pictures(ABC):
 
     @abstractmethod
     def free_camera(self) -> mujoco.MjvCamera:
-        """Return the camera "free"."""
+        """Return the camera named "free"."""
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """What is drawn."""
+        """The model that is drawn."""
         return self._load()
 
     @cached_property
     def data(self) -> mujoco.MjData:
-        """Where everything is; call `place` after a change of positions."""
+        """State that is drawn; call `place` after a change of positions."""
         return mujoco.MjData(self.model)
 
     @property
     def cameras(self) -> list[str]:
-        """Names that `frame` takes."""
+        """Names of cameras that `frame` takes."""
         named = [name for i in range(self.model.ncam) if (name := self.model.camera(i).name)]
         return [*named, FREE]
 
     def place(self) -> None:
-        """Compute where bodies, cameras and lights are from the positions in `data`."""
+        """Compute the poses of bodies, cameras and lights from the positions in `data`."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -73,7 +73,7 @@ class Pictures(ABC):
         markers: Iterable[Marker] = (),
         labels: Collection[str] = (),
     ) -> np.ndarray:
-        """Draw what is in `data`, with markers and labels of bodies: uint8 [height, width, 3].
+        """Draw `data` with markers and labels of bodies: RGB, uint8 [height, width, 3].
 
         Raises:
             ValueError: For an unknown camera.
@@ -95,13 +95,13 @@ class Pictures(ABC):
         return renderer.render()
 
     def close(self) -> None:
-        """Free what OpenGL holds; a later picture opens it again."""
+        """Free the resources of OpenGL; a later picture opens it again."""
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
 
     def _label(self, drawn: mujoco.MjvScene, left: set[str]) -> None:
-        """Write the name of every labelled body at the first of its shapes."""
+        """Write the names of some bodies, `left`, each at the first of its shapes."""
         for geom in drawn.geoms[: drawn.ngeom] if left else ():
             if geom.objtype != mujoco.mjtObj.mjOBJ_GEOM:
                 continue
@@ -112,7 +112,7 @@ class Pictures(ABC):
 
 
 def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
-    """Append markers to what MuJoCo draws; those beyond its capacity are left out."""
+    """Append markers to MuJoCo's scene; those beyond its capacity are left out."""
     upright = np.eye(3).reshape(-1)
     for marker in markers:
         if drawn.ngeom == drawn.maxgeom:

@@ -24,18 +24,18 @@ SCHEME = "safe-rl-environments"
 
 
 class EnvironmentsSource(ConfigSource):
-    """Where Hydra finds the group `env`: names are listed, nodes made when they are asked for.
+    """Source in which Hydra finds the group `env`; a node is made when it is loaded.
 
-    Hydra's own store would hold every node, and copies all it holds about a hundred times.
+    Hydra's own store would hold every node, and Hydra copies the store about a hundred times.
     """
 
     @staticmethod
     def scheme() -> str:
-        """Of the source's address in Hydra's search path."""
+        """Return the scheme of the source's address in Hydra's search path."""
         return SCHEME
 
     def available(self) -> bool:
-        """It always is."""
+        """Return whether the source is available: always."""
         return True
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -51,16 +51,16 @@ class EnvironmentsSource(ConfigSource):
         )
 
     def is_group(self, config_path: str) -> bool:
-        """Whether it is the group `env`, or the folder that it is in."""
+        """Return whether a path is that of the group `env`, or of its parent."""
         return config_path.strip("/") in ("", GROUP)
 
     def is_config(self, config_path: str) -> bool:
-        """Whether it is one of the group."""
+        """Return whether a path is that of an environment in the group."""
         group, _, name = config_path.removesuffix(".yaml").rpartition("/")
         return group == GROUP and name in env_names()
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        """Return the names in the group, or the group."""
+        """Return the names of environments for the group, and the group for its parent."""
         here = config_path.strip("/")
         found = {"": (ObjectType.GROUP, [GROUP]), GROUP: (ObjectType.CONFIG, sorted(env_names()))}
         kind, names = found.get(here, (None, []))
@@ -68,10 +68,10 @@ class EnvironmentsSource(ConfigSource):
 
 
 class EnvironmentsSearchPath(SearchPathPlugin):
-    """Adds the source after folders of files: a file is found before an environment of its name."""
+    """Appends the source to the search path, so that a file precedes an environment of its name."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Add the source."""
+        """Append the source."""
         search_path.append(provider="safe_rl", path=f"{SCHEME}://")
 
 
@@ -79,10 +79,10 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
     """Give a configuration a name, with which `env=<name>` and `make_env(name)` find it.
 
     Args:
-        name: Of the environment.
-        config: A configuration of Safety Gym, whole or what differs from the defaults, or a node
-            with the `_target_` of another family; code that names one is trusted with its module,
-            as `import=` is.
+        name: Name of the environment.
+        config: A configuration of Safety Gym (a mapping may have only the keys that differ from the
+            defaults), or a node with the `_target_` of another family. The module of that target
+            may then be imported, as with `import=`.
 
     Raises:
         ConfigError: For an unknown key, or a value that cannot be used.
@@ -106,16 +106,16 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
 
 
 def store_configs() -> None:
-    """Let Hydra find all names in its group `env`: `env=PointGoal1 env.hazards_num=3` works."""
+    """Let Hydra find all names in its group `env`, as in `env=PointGoal1 env.hazards_num=3`."""
     for plugin in (EnvironmentsSource, EnvironmentsSearchPath):
         Plugins.instance().register(plugin)
 
 
 def register_gymnasium() -> None:
-    """Give Gymnasium an id `Safexp-{name}-v0` for every name, and `Safexp-Custom-v0`.
+    """Register `Safexp-{name}-v0` in Gymnasium for every name, and `Safexp-Custom-v0`.
 
-    The custom one has the defaults of every key; all of them take a `config` with keys
-    to change. The velocity family has `SafeHopperVelocity-v0` and so on.
+    The custom environment has the default of every key. All of them take a `config` with keys to
+    change. Ids of the velocity family are `SafeHopperVelocity-v0` and so on.
     """
     ids = {f"Safexp-{name}-v0": name for name in (*SUITE, *EXTRAS)} | {"Safexp-Custom-v0": None}
     ids |= {f"{name}-v0": name for name in VELOCITY_SUITE}

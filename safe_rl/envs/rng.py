@@ -1,10 +1,9 @@
 """Random numbers as a pure function of integers, for batches whose rows must not share a stream.
 
-Every row of a batch has its own seed, and a draw is addressed by what it is for (episode,
-purpose, attempt, object, …) instead of by how many came before it. So row k does not depend
-on the batch size, the other rows or the thread count, and a snapshot needs no generator state.
-Library generators keep one stream per generator; one generator per row would put a Python loop
-over rows into every reset.
+Every row of a batch has its own seed. A draw is identified by its use (episode, purpose, attempt,
+object, …) instead of by the number of earlier draws. So row k does not depend on the batch size,
+the other rows or the thread count, and a saved state needs no generator state. Generators of
+libraries have one stream each. One generator per row would need a loop over rows in every reset.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ def _shift_right(x: Tensor, bits: int) -> Tensor:
 
 
 def _spread(counter: Tensor | int) -> Tensor | int:
-    """Counters times an odd constant, so that neighbours differ in many bits; integers stay so."""
+    """Multiply by an odd constant, so that neighbours differ in many bits; an int stays an int."""
     if isinstance(counter, Tensor):
         return counter * _MIX_2
     return (counter * _MIX_2 + (1 << 63)) % (1 << 64) - (1 << 63)
@@ -41,10 +40,10 @@ def _mix_(x: Tensor) -> Tensor:
 
 
 def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
-    """Hash `key` with counters, one after the other, into new keys.
+    """Hash keys with counters, one counter after the other, into new keys.
 
     Args:
-        key: Int64 of any shape.
+        key: int64 keys of any shape.
         counters: Integers or int64 tensors that broadcast with `key`.
 
     Returns:
@@ -77,9 +76,9 @@ def row_seeds(seed: int, num_rows: int, device: torch.device | None = None) -> T
 
 
 def spread_seed(seed: int) -> int:
-    """Return a seed of 32 bits for libraries whose rows count up from it.
+    """Return a 32-bit seed for a library that seeds its rows with this number and the next ones.
 
-    Those of neighbours must not be the same ones.
+    Neighbouring seeds are spread, so that their ranges of row seeds do not overlap.
 
     Examples:
         >>> abs(spread_seed(1) - spread_seed(0)) > 1000

@@ -1,4 +1,4 @@
-"""What environments that simulate their worlds here have in common: seeds, states, pictures."""
+"""Base class of environments that run the simulation themselves: seeds, states, pictures."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from safe_rl.envs.physics import Physics
 
 
 class SimulatedEnv(ConstrainedEnv):
-    """N worlds on a thread pool: seeds, episodes, states and copies, of any family.
+    """N simulated worlds: seeds, episodes, states and copies, for any family.
 
-    A family builds its physics, observer and renderer, and says how a world is begun, stepped,
-    read and written.
+    The class of a family builds the physics, observer and renderer, and implements how episodes
+    begin, how worlds are stepped, and how their state is read and written.
 
     Args:
         num_envs: Number of worlds, N.
-        device: Where the TensorDicts live.
+        device: Device of the TensorDicts.
         num_threads: Threads that step the physics; 0 for one per core.
     """
 
-    #: Flags that are written beside the numbers, all of them False after a reset.
+    #: Flags of a step, all of them False after a reset.
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
-    #: Camera of pictures where none is named.
+    #: Default camera of pictures.
     first_camera: ClassVar[str]
-    #: What a copy has beside the state: attributes that are tensors.
+    #: Attributes, tensors, that a copy gets in addition to the state.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
-    #: What a step takes in the world's own time [s].
+    #: Simulated time of a step [s].
     seconds_per_step: float
 
-    #: Whether every world is in an episode; once it is, it stays so.
+    #: Whether every world has begun an episode; from then on this stays True.
     _all_begun = False
 
     config: Any
@@ -59,13 +59,13 @@ class SimulatedEnv(ConstrainedEnv):
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
     ) -> None:
-        """Say what is read and written, and take the first seed, when everything else is built.
+        """Set the specs and the first seed, after everything else is built.
 
         Args:
-            model: Whose actuators are controlled.
-            observation: Spec of what is observed in N worlds.
-            highest: The most that a step can cost.
-            seed: Of the environment; None takes one from torch's generator.
+            model: The compiled model, whose actuators are controlled.
+            observation: Spec of the observation of N worlds.
+            highest: Largest cost of a step.
+            seed: Seed of the environment; None takes one from torch's generator.
         """
         physics = self._physics
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
@@ -102,13 +102,15 @@ class SimulatedEnv(ConstrainedEnv):
         return {}
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed worlds on their own, [N]: with the episodes of row 0 of a seed; None leaves one.
+        """Seed every world separately, [N]: it gets the episodes of row 0 of an environment.
+
+        None keeps the seed of a world.
 
         Raises:
             ValueError: If there are not as many seeds as worlds.
         """
         if len(seeds) != self.batch_size[0]:
-            raise ValueError(f"{self.batch_size[0]} worlds need as many seeds, got {len(seeds)}.")
+            raise ValueError(f"There must be {self.batch_size[0]} seeds, got {len(seeds)}.")
         for row, seed in enumerate(seeds):
             if seed is not None:
                 require_integer("seed", seed, lowest=-(2**63))
@@ -136,12 +138,12 @@ class SimulatedEnv(ConstrainedEnv):
         return self._reset_output()
 
     def _reset_output(self) -> TensorDict:
-        """What a reset returns, for the worlds as they are."""
+        """Return the output of a reset for the present state of the worlds."""
         none = torch.zeros_like(self._begun).expand(len(self.flags), -1).unsqueeze(-1).clone()
         return self._pack(dict(zip(self.flags, none, strict=True)))
 
     def _step_output(self, numbers: Tensor, flags: Tensor) -> TensorDict:
-        """What a step returns: reward and costs [1 + K, N], and `flags`, bool [F, N]."""
+        """Return the output of a step: reward and costs [1 + K, N], and `flags`, bool [F, N]."""
         names = ("reward", *self.cost_keys, *self.flags)
         values = (*numbers.to(torch.float32).unsqueeze(-1), *flags.unsqueeze(-1))
         return self._pack(dict(zip(names, values, strict=True)))
@@ -151,7 +153,7 @@ class SimulatedEnv(ConstrainedEnv):
         if self.device != self._physics.device:
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
         outputs["observation"] = self._observe()
-        # As TorchRL's own environments do: every shape and device is right by construction.
+        # TorchRL's own environments do this too: shapes and devices are right by construction.
         return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
@@ -169,32 +171,32 @@ class SimulatedEnv(ConstrainedEnv):
 
     @abstractmethod
     def _begin(self, mask: Tensor) -> None:
-        """Begin the episodes `_episode` in worlds of a mask, bool [N]."""
+        """Begin the episodes `_episode` in the worlds of a mask, bool [N]."""
 
     @abstractmethod
     def _observe(self) -> Tensor | TensorDict:
-        """Return what is observed, on the device; later steps leave it as it is."""
+        """Return the observation on the device; later steps do not change it."""
 
     @abstractmethod
     def _read_state(self) -> TensorDict:
-        """Copy what the worlds are in, without seeds."""
+        """Return a copy of the state of the worlds, without seeds."""
 
     @abstractmethod
     def _write_state(self, state: TensorDictBase) -> None:
-        """Check a state, and put the worlds into it."""
+        """Check a state, and set the worlds to it."""
 
     def get_state(self) -> TensorDict:
-        """Return a copy of everything that determines what happens next, seeds included, [N]."""
+        """Return a copy of the state, a TensorDict [N]: it determines all later steps and draws."""
         state = self._read_state()
         state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
         return state
 
     @torch.no_grad()
     def set_state(self, state: TensorDictBase) -> TensorDict:
-        """Set the worlds to a state, for resuming and tests; returns what a reset returns.
+        """Set the worlds to a state, for resuming and tests; return the output of a reset.
 
         Args:
-            state: TensorDict [N] as `get_state` returns it; without seeds the present ones stay.
+            state: TensorDict [N] from `get_state`. Without seeds, the present seeds remain.
 
         Raises:
             KeyError: If a key is missing.
@@ -209,14 +211,14 @@ class SimulatedEnv(ConstrainedEnv):
         return self._reset_output()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Tell `copy` and `pickle` to build anew and set the state, as far as `set_state` does."""
+        """Let `copy` and `pickle` build a new environment and set its state by `set_state`."""
         settings = (self.config, self.batch_size[0], self.device, 0, *self._physics_settings)
         tensors = {name: getattr(self, name).clone() for name in self.copied}
         return type(self), settings, (self.get_state(), tensors)
 
     def __setstate__(self, kept: tuple[TensorDict, Mapping[str, Tensor]]) -> None:
         state, tensors = kept
-        if tensors["_begun"].any():  # else there are seeds, and nothing else
+        if tensors["_begun"].any():  # otherwise the state is that of a new environment
             self.set_state(state)
         for name, tensor in tensors.items():
             setattr(self, name, tensor)
@@ -230,13 +232,14 @@ class SimulatedEnv(ConstrainedEnv):
         width: int = 480,
         height: int = 360,
     ) -> np.ndarray:
-        """Draw worlds as they are, with a red sphere where a cost is incurred.
+        """Draw the present worlds, with a red sphere where the last step had a cost.
 
         Args:
-            rows: Which worlds; None is all of them.
-            camera: One of those that the class names, or a `mujoco.MjvCamera`; None is the first.
-            width: Of a frame [pixels].
-            height: Of a frame [pixels].
+            rows: Indices of the worlds; None draws all of them.
+            camera: Name from the docstring of the class, or a `mujoco.MjvCamera`; None is the first
+                of the names.
+            width: Width of a frame [pixels].
+            height: Height of a frame [pixels].
 
         Returns:
             RGB, uint8: one frame [height, width, 3] for an integer, else [R, height, width, 3].
@@ -252,17 +255,17 @@ class SimulatedEnv(ConstrainedEnv):
         return frames[0] if isinstance(rows, int) else frames
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free what OpenGL holds."""
+        """Free the resources of OpenGL."""
         self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
 
 
 class ResetNeededError(RuntimeError):
-    """A step before the first reset: there is no episode that it could be one of."""
+    """A step was taken before the first reset."""
 
 
 def require_episodes(begun: Tensor) -> None:
-    """Raise ResetNeededError unless every environment is in an episode, `begun` [N]."""
+    """Raise ResetNeededError unless every row has begun an episode, `begun` [N]."""
     if not begun.all():
         rows = (~begun).nonzero()[:, 0].tolist()
         which = "" if not begun.any() else f" of rows {rows}"
@@ -270,10 +273,10 @@ def require_episodes(begun: Tensor) -> None:
 
 
 def check_state(expected: TensorDictBase, state: TensorDictBase, optional: Collection[str]) -> None:
-    """Compare a state, of which some keys are optional, with one that the environment made.
+    """Check a state, some of whose keys are optional, against one that the environment made.
 
     Raises:
-        KeyError: If another key is missing.
+        KeyError: If a key is missing that is not optional.
         ValueError: If a shape or a type does not fit.
     """
     for key, value in expected.items():

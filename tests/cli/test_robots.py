@@ -113,7 +113,7 @@ def test_what_lies_outside_of_its_folder_is_not_copied(place, run, tmp_path, cap
     meshes = place.format(tmp_path)
     folder = run(meshes=meshes)
     said = capsys.readouterr().out
-    assert f"{tmp_path}/meshes/hat.stl, which is outside of its own folder" in said
+    assert f"{tmp_path}/meshes/hat.stl, which is outside its own folder" in said
     assert "The run keeps no copy of its robot" in said
     assert not (folder / "robot").exists()
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0

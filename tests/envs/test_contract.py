@@ -49,7 +49,7 @@ def test_a_step_without_its_cost_or_with_another_shape_is_named(cost, shape):
 
 
 def test_other_kinds_are_told_what_to_be():
-    with pytest.raises(ContractError, match="no environment of TorchRL"):
+    with pytest.raises(ContractError, match="not a TorchRL environment"):
         check_constrained_env(object())
     lacking = type("Lacking", (PointMass,), {"set_state": None})
     with pytest.raises(ContractError, match="it has 'get_state', so it needs 'set_state'"):

@@ -156,12 +156,12 @@ WRONG = {
                 "</worldbody>", "</body></worldbody>").replace("<freejoint/>", ""),
         "'robot' inside 'cart'",
     ),
-    "a turned root": (changed(BALL, 'pos="0.3 0.2 0.12"', 'euler="90 0 0"'), "turns its body"),
+    "a turned root": (changed(BALL, 'pos="0.3 0.2 0.12"', 'euler="90 0 0"'), "rotates its body"),
     "no actuators": (without(DISC, ACTUATORS), "no actuators"),
     "no root joint": (without(DISC, *JOINTS[:2]), "free joint, or slides"),
     "another body before": (
         changed(BALL, "<worldbody>", '<worldbody><body><freejoint/><geom size="1"/></body>'),
-        "put that body first",
+        "put this body first",
     ),
     "a reversed control range": (
         changed(DISC, '"-0.5 2"', '"2 -0.5"'),

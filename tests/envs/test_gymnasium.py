@@ -205,7 +205,7 @@ def test_some_worlds_may_get_a_seed_of_their_own():
     again, _ = envs.reset(seed=[None, 11, None])
     np.testing.assert_array_equal(again[1], first[1])
     assert (again[0] != first[0]).any()
-    with pytest.raises(ValueError, match="3 worlds need as many seeds, got 2"):
+    with pytest.raises(ValueError, match="There must be 3 seeds, got 2"):
         envs.reset(seed=[1, 2])
 
 

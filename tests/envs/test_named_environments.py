@@ -53,7 +53,7 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
         make_env(node)
     store_config("Slow", node)
     assert make_env(node, num_envs=3).batch_size == (3,)
-    with pytest.raises(ContractError, match=r"asked for 4 environments and made 3.*'num_envs'"):
+    with pytest.raises(ContractError, match=r"made 3 environments instead of 4.*'num_envs'"):
         make_env(node, num_envs=4)
 
 

@@ -103,7 +103,7 @@ def test_a_robot_without_a_camera_is_an_error(tmp_path):
     with pytest.raises(ConfigError, match=r"observe_vision.*no camera named 'vision'"):
         SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
     blind.write_text("\n".join(text).replace('camera name="vision"', 'camera name="eye"'))
-    with pytest.raises(ConfigError, match=r"Its cameras are \['eye'\]: give one that name"):
+    with pytest.raises(ConfigError, match=r"Its cameras are \['eye'\]: rename one of them"):
         SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
 
 

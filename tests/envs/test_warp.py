@@ -272,7 +272,7 @@ def test_what_warp_lacks_is_refused(tmp_path):
     robot = tmp_path / "robot.xml"
     text = ROBOTS["point"].read_text().replace("<option ", '<option solver="PGS" ', 1)
     robot.write_text(text)
-    with pytest.raises(ConfigError, match=r"'physics' warp does not take the robot .*PGS"):
+    with pytest.raises(ConfigError, match=r"'physics' warp does not support the robot .*PGS"):
         SafetyGymEnv(BUSY | {"robot_base": str(robot), "physics": "warp"})
     with pytest.raises(ConfigError, match="'physics' warp runs on the devices cpu and cuda"):
         SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")

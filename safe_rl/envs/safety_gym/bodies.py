@@ -1,4 +1,4 @@
-"""Add bodies to the specification of a world: elements, and objects for pictures."""
+"""Add bodies of elements, and objects for pictures, to the MJCF specification of a world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def add_floor(spec: mujoco.MjSpec) -> None:
 def add_bodies(
     spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool = False
 ) -> None:
-    """Add a body per object: free where it can be pushed, else one that is placed at resets.
+    """Add a body per object: a free body if it can be pushed, else a mocap body.
 
     Areas have a shape only if rays see them, or in a `decorated` world, which is for pictures.
     """
@@ -40,13 +40,13 @@ def add_bodies(
 def add_targets(
     spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool
 ) -> None:
-    """Add a mocap target per object and weld the object to it, without any offset."""
+    """Add a mocap target per object, and weld the object to it without an offset."""
     for name in element.names(config):
         target = spec.worldbody.add_body(
             name=f"{name}_target", pos=[0, 0, element.height(config)], mocap=True
         )
         if config.lidar_type == "natural" and not decorated:
-            # The benchmark's targets have a shape that nothing but rays meets.
+            # The benchmark's targets have a shape that only rays meet.
             _add_geoms(spec, target, config, element, ghost=True)
         weld = spec.add_equality(
             type=mujoco.mjtEq.mjEQ_WELD,
@@ -55,13 +55,13 @@ def add_targets(
             name2=name,
             solref=[0.02, 1.5],
         )
-        # The data a new equality comes with are not a weld's: no anchor, relative pose from the
+        # The data of a new equality are not those of a weld: no anchor, relative pose from the
         # initial one, torque scale 1.
         weld.data[:10], weld.data[10:] = 0, 1
 
 
 def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
-    """Whether an area has a shape, for pictures or rays; a button's goal is the button."""
+    """Whether an area has a shape; the goal of a button task has none, as the button has one."""
     stands_in = element.kind == "goal" and goal_is_button(config.task)
     return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 
@@ -84,7 +84,7 @@ def _add_geoms(
             geom.density = getattr(config, f"{element.kind}_density")
 
 
-# Rotation about x by 45 degrees: a camera that looks north and down.
+# Rotation about x by 45 degrees: the camera looks north and down.
 _NORTH_DOWN = (math.cos(math.pi / 8), math.sin(math.pi / 8), 0.0, 0.0)
 # Fixed cameras: position in the world [m].
 FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
@@ -96,7 +96,7 @@ _FLOOR, _SKY = "safe_rl_floor", "safe_rl_sky"
 SKY_RGB = ((0.7, 0.78, 0.92), (0.42, 0.5, 0.68))  # overhead and underfoot
 FLOOR_RGB = ((0.74, 0.74, 0.74), (0.82, 0.82, 0.82))
 FLOOR_TILE = 0.5  # side of a square of the chequered floor [m]
-SLICES, STACKS = 24, 8  # facets of a round shape; halos have hundreds of spheres
+SLICES, STACKS = 24, 8  # facets of a round shape; few, as halos have hundreds of spheres
 DISPLAY_RIM = 0.1  # how far a cropped floor reaches beyond the placements [m]
 
 
@@ -146,7 +146,7 @@ def _add_sky(spec: mujoco.MjSpec) -> None:
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
-    """Light from above and the south-west; shadows would take software OpenGL much longer."""
+    """Add a light from above and the south-west, without shadows: they slow software OpenGL."""
     spec.worldbody.add_light(
         pos=[0, 0, 4],
         dir=[0.3, 0.4, -1],

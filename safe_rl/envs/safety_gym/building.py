@@ -1,4 +1,4 @@
-"""From a configuration to one compiled model, and the integer maps into its arrays.
+"""Compile the model of a configuration, and find the indices of objects in its arrays.
 
 The model is compiled once per configuration. Everything that differs between episodes is state:
 free bodies are in `qpos`, and static bodies are mocap bodies. The order of bodies is robot, vases,
@@ -32,9 +32,9 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
     """Compile the world of a configuration; with `sleep`, resting free bodies sleep until touched.
 
     A `decorated` world is for pictures: areas are bodies too, and there are cameras, light and a
-    floor pattern. Its `qpos` and first mocap bodies are those of the plain world.
+    floor pattern. It has the same `qpos` and first mocap bodies as the plain world.
     """
-    # A robot file that has changed makes another world.
+    # If the robot's file has changed, the world is compiled again.
     content = fingerprint(robot_path(config.robot_base))
     return _compile(config, content, sleep, decorated)
 
@@ -54,15 +54,15 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
         model = robot.spec.compile()
     except ValueError as error:
         raise ConfigError(
-            f"'robot_base': {config.robot_base} does not fit into the world: {error}. Rename what "
-            "has the name of something in the world."
+            f"'robot_base': {config.robot_base} does not fit into the world: {error}. If a name is "
+            "repeated, rename the robot's part: it has the name of an object in the world."
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
     scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
     return _index(config, model, present, robot, in_physics, contact_names)
 
 
-# After what worlds are built from was registered anew.
+# To be called after an element, task, cost, observation or robot is registered.
 forget_scenes = _compile.cache_clear
 
 
@@ -90,7 +90,7 @@ def _add_objects(
 
 def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
     spec.memory = ARENA_BYTES
-    # MuJoCo 4.0.0 gives wrong normals for cylinders with it; MuJoCo 2 had no such thing.
+    # With this option, MuJoCo 4.0.0 computes wrong normals for cylinders; MuJoCo 2 lacks it.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
     if sleep:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
@@ -141,7 +141,7 @@ def _index(
     in_physics: set[Motion],
     contact_names: dict[str, list[str]],
 ) -> Scene:
-    """Resolve every name to integers."""
+    """Find the indices of all names in the compiled model."""
     names: list[str] = []
     slots, heights = {}, []
     for element in present:

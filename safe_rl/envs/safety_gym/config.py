@@ -1,6 +1,6 @@
 """One environment is one flat, frozen `SafetyGymConfig`; see `config_keys` for its keys.
 
-Lengths are metres, angles radians, times environment steps unless said otherwise.
+Lengths are in metres, angles in radians, and times in environment steps unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ _BUILT_IN: dict[str, Key] = {
     name: vars(Vocabulary)[name]._replace(annotation=annotation)
     for name, annotation in get_type_hints(Vocabulary, include_extras=True).items()
 }
-_keys = dict(_BUILT_IN)  # and those that are registered
+_keys = dict(_BUILT_IN)  # built-in keys and registered ones
 
 
 class SafetyGymConfig(Vocabulary):
     """Everything that defines one environment.
 
-    Keys that `safe_rl.envs.extending` registered are attributes like the others. Types and ranges
+    Keys that `safe_rl.envs.extending` registers are attributes like the others. Types and ranges
     are checked here. Whether a task or robot exists, and whether keys fit together, is checked when
     an environment is made or stored, see `suite.resolve`.
 
     Args:
-        values: of the keys that differ from their defaults.
+        values: Values of the keys that differ from their defaults.
 
     Raises:
-        ConfigError: for an unknown key (the nearest one is named), a wrong type or a value out of
-            range.
+        ConfigError: For an unknown key (the message suggests a known one), a wrong type or a value
+            out of range.
 
     Examples:
         >>> config = SafetyGymConfig(task="goal", hazards_num=3)
@@ -58,13 +58,13 @@ class SafetyGymConfig(Vocabulary):
             vars(self)[name] = coerce(name, key, values.get(name, key.default))
 
     def __getattr__(self, name: str) -> Any:
-        """Return the default of a key that was registered after this was made."""
+        """Return the default of a key that was registered after this configuration was made."""
         if name in _keys:
             return _keys[name].default
         raise AttributeError(f"A SafetyGymConfig has no attribute '{name}'.")
 
     def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"A configuration does not change: use replace({name}=…).")
+        raise AttributeError(f"A configuration cannot be changed: use replace({name}=…).")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SafetyGymConfig.from_dict, (self.to_dict(),)
@@ -89,7 +89,7 @@ class SafetyGymConfig(Vocabulary):
         return self.from_dict({**self.to_dict(), **changes})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the flat mapping of every key, as `from_dict` takes it."""
+        """Return a flat mapping of all keys, which `from_dict` accepts."""
         return {name: getattr(self, name) for name in _keys}
 
 
@@ -124,7 +124,7 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
     """Set the keys that exist in addition to the built-in ones.
 
     Raises:
-        ConfigError: if a key is built in, or a default is not of its type.
+        ConfigError: If a key is built in, or a default does not have the type of its key.
     """
     for name, key in keys.items():
         if name in _BUILT_IN:

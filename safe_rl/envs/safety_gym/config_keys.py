@@ -1,9 +1,9 @@
-"""The keys of an environment: each is declared with type, default, meaning and range.
+"""The configuration keys of an environment, each with its type, range, default and meaning.
 
-Names, defaults and meaning are those of the 2019 Safety Gym engine (paper, section 4.1), so that
-its dictionaries can be used as they are, see also `RETIRED`; `layout_seeds`, `layout_seeds_first`,
-`vases_rots`, `gremlins_rots` and `box_rots` are additions, and so are the scales of the dynamics,
-`physics`, boundaries and `velocity_limit`.
+Names, defaults and meanings are those of the 2019 Safety Gym engine (paper, section 4.1), so that
+its dictionaries can be used unchanged, see also `RETIRED`. Additional keys are `layout_seeds`,
+`layout_seeds_first`, `vases_rots`, `gremlins_rots`, `box_rots`, `physics`, `physics_buffers`, and
+those of the dynamics (scales), boundaries and the velocity limit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _COSTS = "whether there is a cost for "
 _NUMBER = "number of objects"
 _UNUSED = "not used; exists because the 2019 engine has it"
 
-# Keys of 2019 that nothing reads any more -> the value that changes nothing, and what to do else.
+# Keys of 2019 that are not used any more -> the value that is accepted, and what to use instead.
 RETIRED = {
     "_seed": (None, "give `seed` to the environment or its reset instead"),
     "build_resample": (True, "layouts are always drawn again until everything fits"),
@@ -52,7 +52,7 @@ class Vocabulary:
     # physics
     physics: Literal["cpu", "warp"] = key("cpu", "MuJoCo on the CPU, or MuJoCo Warp on the device")
     physics_buffers: Positive = key(
-        2.0, "size of Warp's contact buffers, in multiples of the number in a trial"
+        2.0, "size of Warp's contact buffers, in multiples of the contacts in a trial"
     )
 
     # placement
@@ -60,16 +60,16 @@ class Vocabulary:
         (-2.0, -2.0, 2.0, 2.0), "rectangle for all objects: xmin, ymin, xmax, ymax [m]"
     )
     placements_margin: float = key(0.0, "minimal distance between two keepouts [m]")
-    randomize_layout: bool = key(True, "whether every episode has another layout")
+    randomize_layout: bool = key(True, "whether every episode has a new layout")
     layout_seeds: Annotated[int, Range(1, LARGEST_SEED)] | None = key(
         None, "number of different layouts; None: unlimited"
     )
     layout_seeds_first: Annotated[int, Range(0, LARGEST_SEED)] = key(
         0, "the first of these layout seeds; the others follow it"
     )
-    continue_goal: bool = key(True, "draw a new goal after one was met; False ends the episode")
+    continue_goal: bool = key(True, "draw a new goal after one is met; False: the episode ends")
     terminate_resample_failure: bool = key(
-        True, "end an episode whose new goal has no place; False is an error"
+        True, "end an episode if there is no place for a new goal; False: an error"
     )
 
     # robot
@@ -94,7 +94,7 @@ class Vocabulary:
     observe_box_comp: bool = key(False, "compass to the box")
     observe_box_lidar: bool = key(False, _LIDAR + "the box")
     observe_circle: bool = key(False, _LIDAR + "the circle's centre")
-    observe_remaining: bool = key(False, "share of the episode's steps that are taken")
+    observe_remaining: bool = key(False, "share of the episode's steps taken so far")
     observe_walls: bool = key(False, _LIDAR + "walls")
     observe_hazards: bool = key(False, _LIDAR + "hazards")
     observe_vases: bool = key(False, _LIDAR + "vases")
@@ -102,7 +102,7 @@ class Vocabulary:
     observe_buttons: bool = key(False, _LIDAR + "buttons")
     observe_gremlins: bool = key(False, _LIDAR + "gremlins")
     observe_vision: bool = key(False, "image of the robot's camera")
-    observe_qpos: bool = key(False, "positions of joints; those of a planar root from its start")
+    observe_qpos: bool = key(False, "positions of joints; a planar root's from its start")
     observe_qvel: bool = key(False, "velocities of joints")
     observe_ctrl: bool = key(False, "the last control")
     observe_freejoint: bool = key(False, "position and quaternion of a free root")
@@ -123,10 +123,10 @@ class Vocabulary:
     lidar_type: Literal["pseudo", "natural"] = key(
         "pseudo", "pseudo: from centres; natural: by rays"
     )
-    lidar_alias: bool = key(True, "an object in a bin also raises the two neighbouring bins")
+    lidar_alias: bool = key(True, "an object also raises the two bins next to its own")
     compass_shape: Annotated[int, Range(2, 3)] = key(2, "components of a compass")
     vision_size: Pixels = key((60, 40), "width and height of this image [pixels]")
-    vision_render: bool = key(True, "show it in a corner of rendered frames")
+    vision_render: bool = key(True, "show this image in a corner of rendered frames")
     vision_render_size: Pixels = key((300, 200), "its largest size in frames [pixels]")
 
     # task and reward
@@ -200,7 +200,7 @@ class Vocabulary:
     vases_keepout: NotNegative = key(0.15, _KEEPOUT)
     vases_size: Positive = key(0.1, "half side [m]")
     vases_density: Positive = key(0.001, "density of vases")
-    vases_sink: float = key(4e-5, "depth in the floor at the start [m]")
+    vases_sink: float = key(4e-5, "depth of vases in the floor at the start [m]")
     vases_contact_cost: NotNegative = key(1.0, "cost per contact point with the robot")
     vases_displace_cost: NotNegative = key(0.0, "cost per metre of displacement; 0: no such cost")
     vases_displace_threshold: NotNegative = key(1e-3, "displacement without a cost [m]")
@@ -224,7 +224,7 @@ class Vocabulary:
     buttons_size: Positive = key(0.1, "radius [m]")
     buttons_cost: NotNegative = key(1.0, "cost per contact point of the robot with a wrong button")
     buttons_resampling_delay: Annotated[int, Range(0)] = key(
-        10, "steps without effect of buttons after one was pressed"
+        10, "steps for which buttons have no effect after a goal is met"
     )
 
     # gremlins
@@ -246,5 +246,5 @@ class Vocabulary:
     render_lidar_radius: Positive = key(0.15, "radius of the rings [m]")
     render_lidar_size: Positive = key(0.025, "radius of a ring's spheres [m]")
     render_lidar_offset_init: float = key(0.5, "height of the lowest ring above the robot [m]")
-    render_lidar_offset_delta: float = key(0.06, "distance of a ring from the one below [m]")
+    render_lidar_offset_delta: float = key(0.06, "vertical distance between two rings [m]")
     floor_display_mode: bool = key(False, "crop the visible floor to the placements")

@@ -1,4 +1,4 @@
-"""How a single configuration key is declared, and how its value is checked."""
+"""Declaration of a configuration key, and the check of its value."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from safe_rl.envs.errors import ConfigError
 from safe_rl.ranges import Range, Values, values_of
 
-LARGEST_SEED = 2**62  # of layouts, which are hashed as 64-bit integers
+LARGEST_SEED = 2**62  # of layouts; layout seeds are hashed as 64-bit integers
 
 Objects = Annotated[int, Range(0, 1000)]
 FreeObjects = Annotated[int, Range(0, 200)]
-"""Numbers of objects that move, whose contacts still fit into the physics' memory."""
+"""Number of movable objects; the contacts of more would not fit into the physics' memory."""
 Pixels = tuple[Annotated[int, Range(1, 4096)], Annotated[int, Range(1, 4096)]]
 
 _FOUR = values_of(tuple[float, float, float, float])
@@ -45,9 +45,9 @@ class Key(NamedTuple):
     """A configuration key.
 
     Attributes:
-        default: its value if none is given.
-        annotation: its type and range, such as `float | None` or `safe_rl.ranges.Positive`.
-        meaning: its meaning, for the table of keys.
+        default: Its default value.
+        annotation: Its type and range, such as `float | None` or `safe_rl.ranges.Positive`.
+        meaning: Its meaning, for the table of keys.
     """
 
     default: Any
@@ -56,18 +56,18 @@ class Key(NamedTuple):
 
 
 def key(default: Any, meaning: str) -> Any:
-    """Declare a key of the vocabulary, whose annotation there is its type and range."""
+    """Declare a key of the class `Vocabulary`, where its annotation gives the type and range."""
     return Key(default, None, meaning)
 
 
 @cache
 def allowed(annotation: Any) -> Values:
-    """Return the allowed values of a key with this annotation, in words."""
+    """Return the allowed values of keys with this annotation."""
     return values_of(annotation)
 
 
 def coerce(name: str, key: Key, value: Any) -> Any:
-    """Return `value` as the type of a key, within the key's range; ConfigError if it is not."""
+    """Return a value as the type of its key; ConfigError if the type or range is wrong."""
     if isinstance(key.annotation, str):
         raise ConfigError(f"The type of key '{name}' must be a type, not {key.annotation!r}.")
     values, plain = allowed(key.annotation), _plain(value)
@@ -77,7 +77,7 @@ def coerce(name: str, key: Key, value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Values of NumPy as those of Python, and lists as tuples."""
+    """Return NumPy's scalars as Python's, and lists and other iterables as tuples."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
@@ -86,7 +86,7 @@ def _plain(value: Any) -> Any:
 
 
 def _cast(value: Any, kind: type) -> Any:
-    """Let all numbers in a value be of one type."""
+    """Convert all numbers in a value to one type."""
     if isinstance(value, tuple):
         return tuple(_cast(item, kind) for item in value)
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
@@ -94,7 +94,7 @@ def _cast(value: Any, kind: type) -> Any:
 
 
 def infer_key(name: str, default: Any) -> Key:
-    """Return a key with the type of a default value; ConfigError if the type is not clear."""
+    """Return a key with the type of its default; ConfigError if the type is not clear."""
     kind = type(default[0] if isinstance(default, tuple) and default else default)
     if kind not in (bool, int, float, str):
         raise ConfigError(

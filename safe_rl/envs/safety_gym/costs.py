@@ -1,7 +1,7 @@
 """Safety costs: one batched function per cost key, and the table that names them.
 
-Source: paper section 4.1.3. Every function returns one number per world, [N]. Afterwards
-`constrain_indicator` turns positive numbers into 1.
+Source: paper section 4.1.3. Every function returns one number per world, [N]. If
+`constrain_indicator` is set, `compute_costs` replaces positive numbers by 1.
 """
 
 from __future__ import annotations
@@ -20,46 +20,46 @@ from safe_rl.envs.safety_gym.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
-    """Depth [m] of the robot [N, 2] inside hazards [N, K, 2] of a given radius, summed."""
+    """Depth [m] of the robot [N, 2] in hazards [N, K, 2] of radius `size`, summed: [N]."""
     distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
     return torch.rsub(distance, size).relu_().sum(-1)
 
 
 def contact_cost(contacts: Tensor) -> Tensor:
-    """Contact points of the robot [N, K], summed over the objects."""
+    """Contact points of the robot with K objects, summed: [N, K] -> [N]."""
     return contacts.sum(-1)
 
 
 def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
-    """Distance [m] that objects [N, K, 2] were moved since the reset, if above the threshold."""
+    """Distance [m] of objects [N, K, 2] from their start, where above the threshold, summed."""
     moved = torch.hypot(*(xy - start_xy).unbind(-1))
     return torch.where(moved > threshold, moved, 0.0).sum(-1)
 
 
 def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
-    """Speed [m/s] of objects, where it reaches the threshold, summed: [N, K, 3] -> [N]."""
+    """Speed [m/s] of objects, where at least the threshold, summed: [N, K, 3] -> [N]."""
     speed = torch.linalg.vector_norm(velocity, dim=-1)
     return torch.where(speed >= threshold, speed, 0.0).sum(-1)
 
 
 def wrong_button_cost(contacts: Tensor, goal_button: Tensor, timer: Tensor) -> Tensor:
-    """Contact points [N, K] with buttons that are not the goal [N], while the `timer` [N] is 0."""
+    """Contact points [N, K] with buttons other than the goal [N], where the `timer` [N] is 0."""
     number = torch.arange(contacts.shape[-1], device=contacts.device)
     wrong = number != goal_button.unsqueeze(-1)
     return (contacts * wrong).sum(-1) * (timer == 0)
 
 
 def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Tensor:
-    """How far [m] the robot is outside of |x| ≤ half_x and |y| ≤ half_y, summed: [N, 2] -> [N].
+    """Distance [m] beyond |x| ≤ half_x plus that beyond |y| ≤ half_y: [N, 2] -> [N].
 
-    None is no boundary. The CPO paper's circle task (Achiam et al. 2017, section 8.1) has one in x.
+    None is no boundary. The circle task of CPO (Achiam et al. 2017, section 8.1) has one in x.
     """
     (x, y), (most_x, most_y) = xy.abs().unbind(-1), map(_or_infinite, (half_x, half_y))
     return (x - most_x).clamp_(min=0.0).add_((y - most_y).clamp_(min=0.0))
 
 
 def excess_speed(velocity: Tensor, limit: float | None) -> Tensor:
-    """How much faster [m/s] than the limit the robot moves in the plane: [N, 3] -> [N]."""
+    """Excess [m/s] of the robot's speed in the plane over the limit: [N, 3] -> [N]."""
     speed = torch.hypot(velocity[:, 0], velocity[:, 1])
     return (speed - _or_infinite(limit)).clamp_(min=0.0)
 
@@ -72,10 +72,10 @@ class Cost(NamedTuple):
     """A row: one cost.
 
     Attributes:
-        key: its key in TensorDicts, "cost_<kind>".
-        active: whether a configuration has it.
+        key: Its key in TensorDicts, "cost_<kind>".
+        active: Whether a configuration has this cost.
         magnitude: (config, world) -> [N], 0 or more.
-        touches: kinds whose contacts with the robot it reads.
+        touches: Kinds of objects whose contacts with the robot it reads.
     """
 
     key: str
@@ -113,38 +113,38 @@ BUILT_IN = frozenset(row.key for row in COSTS)
 
 
 def active_costs(config: SafetyGymConfig) -> list[Cost]:
-    """Return the rows that a configuration has, as the table is now."""
+    """Return the rows of the present table that are active in a configuration."""
     return [row for row in COSTS if row.active(config)]
 
 
 def cost_keys(rows: Sequence[Cost]) -> list[str]:
-    """Return the keys an environment writes: the aggregate `cost`, then one per kind."""
+    """Return the cost keys of an environment: `cost`, one per row, and `cost_exception`."""
     return ["cost", *(row.key for row in rows), EXCEPTION_KEY]
 
 
 def compute_costs(
     rows: Sequence[Cost], config: SafetyGymConfig, world: World, failed: Tensor
 ) -> Tensor:
-    """Compute every cost of the worlds as they are, one row for each of `cost_keys(rows)`: [R, N].
+    """Compute the present costs of the worlds, a row for each of `cost_keys(rows)`: [R, N].
 
-    The only cost of worlds whose physics failed, bool [N], is `cost_exception`.
+    Worlds whose physics failed, bool [N], have no cost but `cost_exception` (and the aggregate).
 
     Raises:
-        ConfigError: if a registered cost is not one number of at least 0 per world.
+        ConfigError: If a registered cost is not one number of at least 0 per world.
     """
     magnitudes = [world.require(row.key, row.magnitude(config, world)) for row in rows]
     if world.physics.maybe_any(failed):
         magnitudes = [magnitude.masked_fill(failed, 0.0) for magnitude in magnitudes]
-    exceptions = failed.to(world.physics.dtype)  # the sum has this type, whatever a cost has
+    exceptions = failed.to(world.physics.dtype)  # determines the dtype of the sum
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     if any(row.key not in BUILT_IN for row in rows):
-        # NaN is not, either: an indicator would make 0 of it
+        # this also finds NaN, which would be 0 after `gt_`
         world.physics.check(~(costs >= 0.0), partial(_wrong_cost, rows, costs.clone()))
     return costs.gt_(0.0) if config.constrain_indicator else costs
 
 
 def _wrong_cost(rows: Sequence[Cost], costs: Tensor) -> ConfigError:
-    """Name the first cost that is negative or NaN; the sum is the first row, and says less."""
+    """Return an error that names the first wrong cost; the first row, the sum, is left out."""
     lowest = costs.amin(-1)
     number = 1 + int((~(lowest[1:] >= 0.0)).nonzero()[0])
     wrong = float(lowest[number])

@@ -1,4 +1,4 @@
-"""Drawing single worlds: frames, and images of the robot's camera."""
+"""Draw single worlds: frames, and images of the robot's camera."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.world import Block, Scene, World
 
-TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # where the tracking camera is, from the robot [m]
+TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # position of the tracking camera from the robot [m]
 
 
 class Display(Pictures):
-    """Draws worlds of one configuration. Nothing is built or opened before the first picture.
+    """Draws worlds of one configuration; the model is compiled for the first picture.
 
     Args:
-        config: the environment.
+        config: The configuration of the environment.
 
     Examples:
         >>> from safe_rl.envs import SafetyGymEnv
@@ -38,21 +38,21 @@ class Display(Pictures):
         super().__init__()
         self._config = config
         self.options = mujoco.MjvOption()
-        self.options.geomgroup[:] = 1  # lidar's groups are no reason to hide anything
+        self.options.geomgroup[:] = 1  # all groups are visible; they only serve the lidar
 
     def _load(self) -> mujoco.MjModel:
         return self.scene.model
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """The world as it is drawn."""
+        """The decorated world that is drawn."""
         return build_scene(self._config, decorated=True)
 
     def pose(self, world: World, row: int) -> None:
-        """Set all positions to those in one of the worlds."""
+        """Set all positions to those in one of the worlds, `row`."""
         data, physics = self.data, world.physics
         data.qpos[:] = _numbers(physics.qpos, row)
-        # The plain world's mocap bodies come first, then the areas that have none there.
+        # The mocap bodies of the plain world come first, then areas, which are no bodies there.
         mocap_pos = _numbers(physics.mocap_pos, row)
         num_areas = len(data.mocap_pos) - len(mocap_pos)
         areas = _numbers(world.positions, row)[len(self.scene.names) - num_areas :]
@@ -62,13 +62,13 @@ class Display(Pictures):
         self._follow()
 
     def free_camera(self) -> mujoco.MjvCamera:
-        """A camera in the south that has all placements in view and can be moved."""
+        """Return a movable camera in the south from which all placements are visible."""
         camera = mujoco.MjvCamera()
         camera.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
         return camera
 
     def _follow(self) -> None:
-        """Place the tracking camera behind the robot, looking down at it; not one of its own."""
+        """Place the tracking camera behind the robot, unless it is one of the robot's file."""
         model, data = self.scene.model, self.data
         camera = model.camera(TRACK).id
         if model.cam_bodyid[camera] != 0:
@@ -82,7 +82,7 @@ class Display(Pictures):
         data.cam_xmat[camera] = axes.reshape(-1)
 
     def _heading(self) -> np.ndarray:
-        """Horizontal direction in which the robot looks [3]: its camera's, or its x axis."""
+        """Return the robot's horizontal direction [3]: that of its camera, or its x axis."""
         model, data = self.scene.model, self.data
         camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, VISION)
         if camera >= 0:
@@ -98,16 +98,16 @@ def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
 
 
 def vision_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
-    """The component `vision`: RGB in [0, 1], lines from top to bottom, [height, width, 3].
+    """Return the component `vision`: RGB in [0, 1], rows from top to bottom, [height, width, 3].
 
     Raises:
-        ConfigError: if the robot has no camera.
+        ConfigError: If the robot has no camera of the name "vision".
     """
     if not config.observe_vision:
         return []
     cameras = [scene.model.camera(i).name for i in range(scene.model.ncam)]
     if VISION not in cameras:
-        others = f" Its cameras are {cameras}: give one that name." if cameras else ""
+        others = f" Its cameras are {cameras}: rename one of them." if cameras else ""
         raise ConfigError(
             f"'observe_vision': robot {config.robot_base!r} has no camera named '{VISION}'.{others}"
         )
@@ -116,7 +116,7 @@ def vision_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -
 
     def read(world: World) -> Tensor:
         pixels = torch.empty(len(world.step_count), height, width, 3, dtype=torch.uint8)
-        # OpenGL draws one picture after the other.
+        # OpenGL draws one picture at a time.
         for row, picture in enumerate(pixels):
             display.pose(world, row)
             picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))

@@ -1,6 +1,6 @@
 """Random draws: the start of an episode, new goals, noise and frame skip.
 
-Every draw has a key from its row's seed, the episode, its purpose and the step, see `rng`.
+The key of every draw is made of the row's seed, the episode, the step and its purpose, see `rng`.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Purpose(IntEnum):
     NOISE = 4
     FRAMESKIP = 5
     SPLIT = 6
-    FIRST_GOAL = -1  # beside the steps, whose numbers stand in the same place of an address
+    FIRST_GOAL = -1  # differs from all step numbers, which are in the same place of a key
 
 
 def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
-    """Pick layouts uniformly from the finite set of `layout_seeds`, by keys [N]: layout keys [N].
+    """Pick layouts uniformly from the finite set of `layout_seeds`: keys [N] -> layout keys [N].
 
-    They depend only on the picked layout seeds. So environments with other seeds, and evaluations
-    on the same set, have the same layouts.
+    A layout key depends only on the picked layout seed. So environments with other seeds, and
+    evaluations on the same set, have the same layouts.
     """
     assert config.layout_seeds is not None
     index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
@@ -57,7 +57,7 @@ def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
 
 
 def pinned_yaws(scene: Scene) -> Tensor:
-    """Yaw of the robot and of every free body, NaN where the configuration fixes none [1 + F]."""
+    """Return fixed yaws of the robot and of the free bodies, NaN where they are drawn [1 + F]."""
     config = scene.config
     yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
     if config.robot_rot is not None:
@@ -74,12 +74,12 @@ def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     """Draw the positions of robot and objects for episodes with keys [B]: [B, 1 + M, 2].
 
     Raises:
-        LayoutError: naming the object that did not fit.
+        LayoutError: If there is no layout; the message names the object that did not fit.
     """
     layouts = sample_layouts(plan, rng.fold(key, Purpose.LAYOUT))
     if "goal" in plan.names:
-        # The benchmark's first goals are second draws, which keep clear of objects that were placed
-        # to keep clear of the first. Where there is no other place, the first one stays.
+        # As in the benchmark, the first goal is drawn again after all objects are placed, so it is
+        # a second draw. Where no place is found, the first draw remains.
         position, found = resample_goal(plan, physics, rng.fold(key, Purpose.FIRST_GOAL), layouts)
         put(layouts[:, plan.goal_column], found, position)
     return layouts
@@ -89,10 +89,10 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
     """Set the worlds of a mask, bool [N], to the initial state of a new episode.
 
     Args:
-        world: the worlds; those in `mask` are brought up to date.
-        layouts: positions of the robot and all objects [N, 1 + M, 2].
-        key: random key of each world's episode, int64 [N].
-        mask: worlds that begin a new episode.
+        world: The worlds; outputs are updated in those of the mask.
+        layouts: Positions of the robot and all objects [N, 1 + M, 2].
+        key: Random key of each world's episode, int64 [N].
+        mask: Worlds that begin a new episode.
     """
     scene = world.scene
     put(world.layout, mask, layouts)
@@ -113,17 +113,17 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
 
 
 def _choose_button(world: World, key: Tensor, mask: Tensor) -> None:
-    """Choose goal buttons uniformly in some worlds; the same one may come again."""
+    """Draw goal buttons uniformly in the worlds of a mask; the old one may be drawn again."""
     button = (rng.uniform(key) * world.scene.config.buttons_num).to(torch.int64)
     put(world.goal_button, mask, button)
     point_goal_at_button(world, mask)
 
 
 def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> Tensor:
-    """Draw a new goal for the worlds of a mask; returns where no place was found, bool [N].
+    """Draw a new goal for the worlds of a mask; return those without a place for it, bool [N].
 
     Raises:
-        LayoutError: for those, if `terminate_resample_failure` is False.
+        LayoutError: If there are such worlds and `terminate_resample_failure` is False.
     """
     config, physics = world.scene.config, world.physics
     world.buttons_timer.masked_fill_(mask, config.buttons_resampling_delay)
@@ -150,7 +150,7 @@ def _no_place() -> LayoutError:
 
 
 def _current(world: World) -> Tensor:
-    """Where everything is now, in the columns of a layout; gremlins keep their layout position."""
+    """Return present positions as a layout [N, 1 + M, 2]; gremlins have those of the start."""
     current = torch.cat([world.robot_pos[:, None, :2], world.positions[..., :2]], 1)
     guided = world.scene.guided
     columns = slice(1 + guided.start, 1 + guided.stop)
@@ -174,16 +174,16 @@ def draw_substeps(config: SafetyGymConfig, key: Tensor) -> Tensor:
 class LayoutsAhead:
     """Layouts by their keys, drawn in advance and stored until they are needed.
 
-    A layout depends only on its key, and drawing one layout takes about as long as drawing a
-    hundred. So when a row begins an episode, the next layouts of the other rows are drawn too. A
-    saved state of the worlds does not need these.
+    A layout depends only on its key, and to draw one layout takes about as long as to draw a
+    hundred. So when a row begins an episode, the next layouts of the other rows are drawn too. They
+    need not be part of a saved state.
 
     Args:
-        draw: draws layouts of keys, int64 [B] -> [B, 1 + M, 2]; raises `LayoutError` if there is
-            none for one of them.
-        num_envs: number of rows, N.
+        draw: Draws the layouts of keys, int64 [B] -> [B, 1 + M, 2]; raises `LayoutError` if there
+            is none for one of the keys.
+        num_envs: Number of rows, N.
         num_columns: 1 + M.
-        device: where the keys are.
+        device: Device of the keys.
     """
 
     def __init__(
@@ -199,15 +199,15 @@ class LayoutsAhead:
         self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64, device=device)
 
     def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
-        """Layouts [N, 1 + M, 2], up to date in the rows of a mask, whose episodes begin.
+        """Return layouts [N, 1 + M, 2] that are valid in the rows of a mask.
 
         Args:
-            key: keys of the episodes that begin, int64 [N].
-            following: keys of the episodes after the present ones, int64 [N].
-            mask: bool [N].
+            key: Keys of the layouts of the present episodes, int64 [N].
+            following: Keys of the layouts of the next episodes, int64 [N].
+            mask: Rows that begin an episode, bool [N].
 
         Raises:
-            LayoutError: naming the object that did not fit.
+            LayoutError: If there is no layout; the message names the object that did not fit.
         """
         if (self._lacks(key) & mask).any():
             wanted = torch.where(mask, key, following)
@@ -215,7 +215,7 @@ class LayoutsAhead:
             try:
                 self._remember(wanted, missing)
             except LayoutError:
-                # perhaps there is none for an episode that never comes
+                # The missing layout may be that of a next episode, which perhaps never begins.
                 self._remember(wanted, missing & mask)
         return self._layouts
 

@@ -22,7 +22,7 @@ BOX, CYLINDER, SPHERE = (
     mujoco.mjtGeom.mjGEOM_SPHERE,
 )
 
-# Where each kind stands in the order of placement; "robot" is not an element but is placed too.
+# Order in which kinds are placed; "robot" is not an element but is placed too.
 PLACEMENT_ORDER = [
     *("robot", "walls", "goal", "box", "buttons"),
     *("hazards", "vases", "pillars", "gremlins"),
@@ -36,11 +36,11 @@ class Motion(Enum):
     """How an element takes part in the physics.
 
     Attributes:
-        FREE: a body that can be pushed, as vases.
-        GUIDED: a body that follows a target on a circle of radius `<kind>_travel` [m] around its
+        FREE: A body that can be pushed, as vases.
+        GUIDED: A body that follows a target on a circle of radius `<kind>_travel` [m] around its
             position in the layout, as gremlins; it moves by itself and can be pushed.
-        STATIC: collides and never moves within an episode, as pillars.
-        VIRTUAL: an area without physics, as hazards.
+        STATIC: A body that collides and does not move within an episode, as pillars.
+        VIRTUAL: An area without physics, as hazards.
     """
 
     FREE = "free"
@@ -62,18 +62,18 @@ class Element:
     """One kind of object.
 
     Attributes:
-        kind: prefix of its configuration keys and of its lidar ("hazards").
-        label: name of one object in layouts and errors. There are `<kind>_num` objects, with an
-            index. If kind and label are equal, there is one object, in the tasks that list this
-            kind.
-        motion: how it takes part in the physics.
+        kind: Prefix of its configuration keys and of its lidar ("hazards").
+        label: Name of one object in layouts and errors. There are `<kind>_num` objects, whose names
+            have an index. If kind and label are equal, there is one object, without an index, in
+            the tasks that list this kind.
+        motion: How it takes part in the physics.
         height: z of the object's centre [m].
-        geoms: its shapes.
-        rgb: colour in pictures and lidar halos.
+        geoms: Its shapes.
+        rgb: Colour in pictures and lidar halos.
         group: MuJoCo geom group. With `lidar_type="natural"` a lidar sees all kinds of one group;
             otherwise any number from 0 to 5 is possible.
-        flag: configuration key that turns its lidar on; "" for `observe_<kind>`.
-        always_observed: whether the lidar is there (all zeros) even without any object.
+        flag: Configuration key that turns its lidar on; "" means `observe_<kind>`.
+        always_observed: Whether the observation has the lidar (all zeros) even without objects.
     """
 
     kind: str
@@ -101,13 +101,13 @@ class Element:
         )
 
     def names(self, config: SafetyGymConfig) -> list[str]:
-        """Names of this kind's objects."""
+        """Return the names of the objects."""
         count = self.count(config)
         return [self.label] if self.singular else [f"{self.label}{i}" for i in range(count)]
 
     @property
     def singular(self) -> bool:
-        """Whether there is at most one, which has a name without an index."""
+        """Whether there is at most one object, whose name has no index."""
         return self.label == self.kind
 
 

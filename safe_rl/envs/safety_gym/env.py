@@ -57,28 +57,28 @@ class SafetyGymEnv(SimulatedEnv):
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
 
     A state has `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
-    `buttons_timer`, `step_count`, `act` and `history` of actuators with a state, and the layout and
-    seeds, which may be missing in a state that is set. Setting a state wakes sleeping bodies; with
-    `sleep` False the continuation is identical to the last digit.
+    `buttons_timer`, `step_count`, and keys that may be missing in a state that is set: `ctrl`,
+    `act`, `history`, `target_quat`, `layout`, `start_pose`, `seed` and `episode`. `set_state` wakes
+    sleeping bodies; with `sleep` False the continuation is identical to the last digit.
 
-    Cameras of pictures, which also show lidar halos, are "fixedfar", "fixednear", "track" (behind
-    the robot), "vision" (the robot's) and "free" (above).
+    The cameras of pictures are "fixedfar", "fixednear", "track" (behind the robot), "vision" (the
+    robot's) and "free" (above). Pictures also show lidar halos.
 
     Args:
-        env: name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
+        env: Name in the suite ("PointGoal1", "Safexp-PointGoal1-v0"), mapping of configuration
             keys, or `SafetyGymConfig`.
-        num_envs: number of worlds, N.
-        device: device of the TensorDicts. The physics runs on the CPU; if the key `physics` is
-            "warp", it also runs on this device.
-        seed: integer that determines every random draw; None takes one from torch's generator. Row
+        num_envs: Number of worlds, N.
+        device: Device of the TensorDicts. The physics runs on the CPU, or on this device if the key
+            `physics` is "warp".
+        seed: Integer that determines every random draw; None takes one from torch's generator. Row
             k has the same episodes for any N and any number of threads.
-        num_threads: threads that step the physics; 0 for one per core.
-        sleep: let resting objects sleep until touched, which is faster and changes no statistics;
+        num_threads: Threads that step the physics; 0 for one per core.
+        sleep: Let resting objects sleep until touched, which is faster and changes no statistics;
             with `physics` "warp" they never sleep.
 
     Raises:
-        ConfigError: for an unknown name or key, or a value that cannot be used.
-        LayoutError: at a reset, if the objects do not fit.
+        ConfigError: For an unknown name or key, or a value that cannot be used.
+        LayoutError: At a reset, if the objects do not fit.
 
     Examples:
         >>> env = SafetyGymEnv("PointGoal1", num_envs=4, seed=0)
@@ -129,7 +129,7 @@ class SafetyGymEnv(SimulatedEnv):
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """Names of the objects, in the order they have in a state's `layout` after the robot."""
+        """Names of the objects, in the order of a state's `layout`, where the robot is first."""
         return self._world.scene.names
 
     @property
@@ -140,15 +140,15 @@ class SafetyGymEnv(SimulatedEnv):
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
         if seed is not None:
-            # One layout for all rows where the configuration wants a single one.
+            # The layout of all rows if `randomize_layout` is False.
             self._fixed_layout = self._layout_of(seed)
 
     def _layout_of(self, seed: int) -> Tensor:
-        """Random key of the single layout of a seed."""
+        """Return the random key of the only layout of a seed, for `randomize_layout` False."""
         return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed every world, [N], and its layout; None keeps the seed of a world."""
+        """Seed every world and its layout separately, [N]; None keeps the seed of a world."""
         super().set_row_seeds(seeds)
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
         for row, seed in enumerate(seeds):
@@ -156,14 +156,14 @@ class SafetyGymEnv(SimulatedEnv):
                 self._fixed_layout[row] = self._layout_of(seed)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
-        """Random keys of the layouts that many episodes after the current ones, [N]."""
+        """Return random keys of the layouts of the `ahead`-th next episodes, [N]."""
         key = rng.fold(self._row_seed, self._episode + ahead)
         if not self.config.randomize_layout:
             key = self._fixed_layout.expand(self.batch_size)
         return key if self.config.layout_seeds is None else pick_layouts(self.config, key)
 
     def _step_key(self) -> Tensor:
-        """Random key of the step that is being taken, [N]."""
+        """Return random keys of the step that is being taken, [N]."""
         return rng.fold(self._row_seed, self._episode, self._world.step_count + 1)
 
     def _begin(self, mask: Tensor) -> None:
@@ -203,7 +203,7 @@ class SafetyGymEnv(SimulatedEnv):
         return self._step_output(torch.cat([reward.unsqueeze(0), costs]), flags)
 
     def _advance(self, action: Tensor) -> Tensor:
-        """Run the substeps of one step; return the worlds whose physics failed [N]."""
+        """Run the substeps of one step; return the worlds whose physics failed, bool [N]."""
         config, physics = self.config, self._physics
         control = action.clamp(*self._control_range)
         counts = None
@@ -220,7 +220,10 @@ class SafetyGymEnv(SimulatedEnv):
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Give worlds that met their goal a new one; return these, and those without a place."""
+        """Draw new goals where they are met; return these worlds, and those without a place.
+
+        The second value is None if no goal was drawn.
+        """
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
@@ -235,9 +238,9 @@ class SafetyGymEnv(SimulatedEnv):
         """Return the positions of robot and objects, for shields, privileged critics and plots.
 
         Returns:
-            TensorDict [N] of copies, float64 [N, K, 3] each (m, in the world's frame): `robot` (its
-            root body, K = 1), and the centres of the objects of every kind that there is, by kind:
-            `goal` (K = 1; that of a button task is the goal button's place), `hazards`, …
+            TensorDict [N] of copies, [N, K, 3] each (m, in the world's frame): `robot` (its root
+            body, K = 1), and the centres of the objects of every kind that exists, by kind: `goal`
+            (K = 1; in a button task, the position of the goal button), `hazards`, …
         """
         places = {"robot": self._world.robot_pos.unsqueeze(1), **self._world.objects}
         return TensorDict(places, self.batch_size).clone().to(self.device)

@@ -1,6 +1,6 @@
 """Geometry of points and bodies: distances, frames, directions, circles.
 
-Lengths in metres, angles in radians.
+Lengths are in metres, angles in radians.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
 
 
 def to_ego(position: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
-    """Rotate positions [N, M, 3] into the frame of robots at [N, 3] with axes [N, 3, 3]."""
+    """Transform positions [N, M, 3] into the frames of robots at [N, 3] with axes [N, 3, 3]."""
     return (position - robot_pos.unsqueeze(-2)) @ robot_mat
 
 
 def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
-    """Rotate points on the floor [N, M, 2] into the robot's frame, without z, in few passes.
+    """Transform points on the floor [N, M, 2] into the robot's frame, without z: [N, M, 2].
 
-    The result [N, M, 2] has all x before all y in memory, as the passes that follow want it.
+    In memory all x are before all y, which makes later operations on one coordinate faster.
     """
     robot_xy, robot_z = robot_pos.split([2, 1], -1)
     x, y = (xy - robot_xy.unsqueeze(1)).unbind(-1)
@@ -33,7 +33,7 @@ def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
 
 
 def compass(ego: Tensor, num_components: int) -> Tensor:
-    """Direction to objects in the robot's frame: [N, K, 3] -> [N, K, 2 or 3], nearly unit."""
+    """Directions to objects in the robot's frame, nearly unit vectors: [N, K, 3] -> [N, K, D]."""
     vector = ego[..., :num_components]
     return vector / (torch.linalg.vector_norm(vector, dim=-1, keepdim=True) + 1e-3)
 
@@ -55,12 +55,12 @@ def circling_targets(
     """Positions of the gremlins' targets before each of S substeps: [N, S, K, 3].
 
     Args:
-        centres: where the gremlins were placed [N, K, 2].
-        time: simulation time before the first substep [N]; at 0 targets stand at +travel along y.
-        travel: radius of the circle [m], for all or for each [K].
+        centres: Positions of the gremlins in the layout [N, K, 2].
+        time: Time before the first substep [N] (s); at 0 targets are at +travel along y.
+        travel: Radius of the circle [m], for all or for each [K].
         height: z of the targets [m], for all or for each [K].
-        timestep: length of a substep [s].
-        num_substeps: S.
+        timestep: Length of a substep [s].
+        num_substeps: Number of substeps, S.
     """
     steps = torch.arange(num_substeps, dtype=time.dtype, device=time.device)
     phase = (time.unsqueeze(-1) + timestep * steps)[..., None]

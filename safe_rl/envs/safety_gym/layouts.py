@@ -1,7 +1,7 @@
-"""Where objects may be placed, and batched rejection sampling of layouts and of new goals.
+"""Areas where objects may be placed, and batched rejection sampling of layouts and new goals.
 
-Many layouts are drawn at once: one object after the other, for all rows together. Distances and
-lengths are in metres.
+Many layouts are drawn at once: one object after the other, for all rows together. Lengths are in
+metres.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BY_KIND, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.tasks import goal_is_button
 
-PIN_TOLERANCE = 1e-9  # half width of the square that a pinned location stands for
+PIN_TOLERANCE = 1e-9  # half side of the square from which a pinned location is drawn
 
 
 @dataclass(frozen=True)
 class PlacementPlan:
-    """The objects to place, their order, and where each may be.
+    """The objects to place, their order, and the areas where each may be placed.
 
     Attributes:
-        names: the P objects in order of placement.
-        kinds: the kind of each.
-        columns: column of each in a layout [.., 1 + M, 2]: 0 the robot, 1 + slot an object.
+        names: Names of the P objects in order of placement.
+        kinds: Kind of each.
+        columns: Column of each in a layout [.., 1 + M, 2]: 0 for the robot, 1 + slot for an object.
         num_columns: 1 + M.
-        rectangles: where the centres may be, [P, R, 4] (xmin, ymin, xmax, ymax).
-        thresholds: cumulative probability of each object's rectangles, [P, R].
-        keepouts: [P].
-        margin: added to the sum of two keepouts.
+        rectangles: Areas of the centres, [P, R, 4] (xmin, ymin, xmax, ymax).
+        thresholds: Cumulative probability of each object's rectangles, [P, R].
+        keepouts: Keepout of each, [P].
+        margin: Added to the sum of two keepouts.
     """
 
     names: tuple[str, ...]
@@ -55,14 +55,14 @@ class PlacementPlan:
 
     @cached_property
     def beside_goal(self) -> tuple[int, Tensor, Tensor]:
-        """Index of the goal in the order, columns [P - 1] of the others, and clearances [P - 1]."""
+        """Goal's index in `names`, columns of the other objects, and clearances, both [P - 1]."""
         item = self.names.index("goal")
         others = [i for i in range(len(self.names)) if i != item]
         columns = torch.tensor([self.columns[i] for i in others], device=self.keepouts.device)
         return item, columns, self.clearance(item, others)
 
     def clearance(self, item: int, others: slice | list[int]) -> Tensor:
-        """Minimal distances of an object from the others, [K]."""
+        """Return the smallest allowed distances of an object from K others, [K]."""
         return (self.keepouts[others] + self.keepouts[item] + self.margin).clamp(min=0.0)
 
 
@@ -72,10 +72,10 @@ def plan_placements(
     num_slots: int,
     device: torch.device | None = None,
 ) -> PlacementPlan:
-    """Build the plan of a configuration, for kinds in slots of the M objects.
+    """Build the plan of a configuration, whose kinds have slots among the M objects.
 
     Raises:
-        ConfigError: if a placement leaves no room for its object's keepout.
+        ConfigError: If a placement leaves no room for its object's keepout.
     """
     names, kinds, columns, keepouts, rectangles = [], [], [], [], []
     for kind in PLACEMENT_ORDER:
@@ -107,7 +107,7 @@ def plan_placements(
 def _rectangles(
     config: SafetyGymConfig, kind: str, label: str, index: int
 ) -> list[tuple[float, ...]]:
-    """Rectangles for the centre of one object: its placements, reduced by its keepout."""
+    """Return rectangles for the centre of one object: its placements, reduced by its keepout."""
     locations = getattr(config, f"{kind}_locations")
     keepout = getattr(config, f"{kind}_keepout")
     if index < len(locations):
@@ -115,7 +115,7 @@ def _rectangles(
         tolerance = PIN_TOLERANCE
         return [(x - tolerance, y - tolerance, x + tolerance, y + tolerance)]
     placements = getattr(config, f"{kind}_placements") or (config.placements_extents,)
-    # A rectangle of twice the keepout is a point, which rounding may turn inside out.
+    # If a side is twice the keepout, a point remains, and rounding may make its size negative.
     least = 2 * keepout - PIN_TOLERANCE
     shrunk: list[tuple[float, ...]] = [
         (xmin + keepout, ymin + keepout, xmax - keepout, ymax - keepout)
@@ -124,7 +124,7 @@ def _rectangles(
     ]
     if not shrunk:
         raise ConfigError(
-            f"There is no room for '{label}': of its placements {placements} none is as large as "
+            f"There is no room for '{label}': none of its placements {placements} is as large as "
             f"twice its keepout ({keepout}). Enlarge '{kind}_placements' or 'placements_extents', "
             f"or reduce '{kind}_keepout'."
         )
@@ -132,7 +132,7 @@ def _rectangles(
 
 
 def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
-    """Pad to one tensor; cumulative probabilities are in proportion to the areas."""
+    """Pad to one tensor [P, R, 4]; also return cumulative probabilities by area, [P, R]."""
     most = max(len(group) for group in rectangles)
     padded = torch.tensor(
         [group + [group[-1]] * (most - len(group)) for group in rectangles], dtype=torch.float64
@@ -148,23 +148,23 @@ def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
 TRIES_PER_OBJECT = 100
 TRIES_PER_LAYOUT = 10_000
 TRIES_PER_GOAL = 10_000
-# Where the host does not look whether all have a place, always as many: as good as enough.
+# Always this many tries if the host does not read results; they nearly always suffice.
 TRIES_UNSEEN = 200
 _BLOCK = 10  # candidates for an object that are tested at once
-_GOAL_BLOCK = 40  # and for a new goal: mostly enough, and a second round takes as long again
-_MAX_ROWS = 4096  # layouts, or candidates for new goals, at once: a bound on memory
-# Layouts of a batch that may fail before the first one is found; the lower number where each of
-# them takes long, by the pairs of objects that were compared.
+_GOAL_BLOCK = 40  # the same for a new goal; they mostly suffice without a second round
+_MAX_ROWS = 4096  # most layouts, or candidates for new goals, at once: a bound on memory
+# Layouts of a batch that may fail before the first one is found. The lower number applies if
+# layouts take long, which is measured by the compared pairs of objects.
 _HOPELESS_LAYOUTS = (100, 10_000)
 _HOPELESS_PAIRS = 1 << 26
 
 
 class LayoutError(ValueError):
-    """No layout was found; the message names the object that did not fit."""
+    """No layout was found; the message names the object that most often did not fit."""
 
 
 def _draw(plan: PlacementPlan, item: int, key: Tensor) -> Tensor:
-    """One candidate position of an object per key: [...] -> [..., 2]."""
+    """Draw a candidate position of an object per key: [...] -> [..., 2]."""
     rectangles, thresholds = plan.rectangles[item], plan.thresholds[item]
     uniform = rng.uniform(key.unsqueeze(-1), torch.arange(3, device=key.device))
     if len(rectangles) == 1:
@@ -184,7 +184,7 @@ def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
 
 
 def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
-    """Place one object beside those placed before: keys [B], placed [B, K, 2] -> [B, 2], ok [B]."""
+    """Place one object beside the K placed ones: keys [B], [B, K, 2] -> [B, 2], success [B]."""
     clearance = plan.clearance(item, slice(item))
     position = placed.new_zeros(len(key), 2)
     pending = torch.arange(len(key), device=key.device)
@@ -203,7 +203,7 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
 
 
 def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Try one layout per key [B]: positions [B, P, 2], and the object that did not fit or -1."""
+    """Try one layout per key [B]: positions [B, P, 2], and the object without a place or -1 [B]."""
     positions = plan.keepouts.new_zeros(len(key), len(plan.names), 2)
     misfit = torch.full_like(key, -1)
     alive = torch.arange(len(key), device=key.device)
@@ -218,7 +218,7 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Growing ranges of attempts, so that a few difficult rows don't take thousands of rounds."""
+    """Yield growing ranges of attempts, so that few difficult rows need not thousands of rounds."""
     start, most = 0, max(1, _MAX_ROWS // max(1, rows))
     size = 1
     while start < total:
@@ -231,10 +231,11 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for objects not placed.
 
     Objects are placed one after the other, with 100 tries each. If one does not fit, the whole
-    layout is drawn again, at most 10,000 times, and less often if no row's layout is found.
+    layout is drawn again, at most 10,000 times, or fewer if no layout is found for any row.
 
     Raises:
-        LayoutError: naming the object that did not fit, and the keys that it depends on.
+        LayoutError: If there is no layout; the message names the object that most often did not
+            fit, and the keys that matter.
     """
     layouts = plan.keepouts.new_zeros(len(key), plan.num_columns, 2)
     misfits = key.new_zeros(len(plan.names))
@@ -257,7 +258,7 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
 
 
 def _is_hopeless(misfits: Tensor) -> bool:
-    """Whether to give up, by the number of layouts that failed at each object."""
+    """Whether to give up, from the number of layouts that failed at each object, [P]."""
     failed = int(misfits.sum())
     numbers = torch.arange(1, 1 + len(misfits), device=misfits.device)
     pairs = int((misfits * numbers.square()).sum())
@@ -285,15 +286,15 @@ def resample_goal(
     """Draw a new goal position that keeps its distance from all other current positions.
 
     Args:
-        plan: the plan, with a goal in it.
-        physics: the backend, which says whether the host reads results.
-        key: random keys, int64 [B].
-        layouts: current positions.
-        wanted: layouts that get a new goal, bool [B]; None: all.
+        plan: A plan with a goal.
+        physics: The backend, which knows whether the host reads results.
+        key: Random keys, int64 [B].
+        layouts: Present positions [B, 1 + M, 2].
+        wanted: Rows that get a new goal, bool [B]; None: all.
 
     Returns:
-        The positions [B, 2], and whether one was wanted and found [B]: within 10,000 draws, or
-        within 200 if the host does not read results.
+        The positions [B, 2], and whether one was wanted and found, bool [B]: within 10,000 draws,
+        or within 200 if the host does not read results.
     """
     item, columns, clearance = plan.beside_goal
     position = layouts.new_zeros(len(key), 2)

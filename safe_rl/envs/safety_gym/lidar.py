@@ -1,7 +1,7 @@
-"""Lidars: how near objects are in each direction (paper section 4.1.4).
+"""Lidars: closeness of objects in each direction (paper section 4.1.4).
 
 The pseudo-lidar uses directions and distances of object centres. The natural lidar casts rays in
-the physics and sees surfaces.
+the physics, which measure the distances of surfaces.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from safe_rl.envs.safety_gym.world import Block, Scene, World
 
 
 def _num_laps(num_bins: int) -> int:
-    """Number of turns of the circle in the array of readings, so that bin indices need not wrap."""
+    """Return the turns of the circle in the array of readings, so that bin indices do not wrap."""
     return 2 if num_bins > 2 else 4
 
 
 def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) -> Tensor:
-    """Cells that objects straight ahead are written to, in one array for all lidars of all robots.
+    """Return the cells of objects straight ahead, in one array for all lidars of all robots.
 
-    `group`, int64 [M], is the lidar (of G) that sees each object. The result [3, N, M] has the
-    cells of the bin before the object's, of its own, and of the one after. Cells are ordered by
-    robot, then by lidar; each lidar has several turns of the circle.
+    `group`, int64 [M], is the lidar (of G) that sees each object. The result, int64 [3, N, M], has
+    the cell of the bin before the object's own, of its own, and of the one after. Cells are ordered
+    by robot, then by lidar; each lidar has several turns of the circle.
     """
     laps = _num_laps(num_bins)
     robot = torch.arange(num_robots, device=group.device).unsqueeze(1)
@@ -47,16 +47,17 @@ def pseudo_lidar(
     exp_gain: float,
     alias: bool,
 ) -> Tensor:
-    """Closeness of the nearest object in every direction, for several kinds of object at once.
+    """Return the closeness of the nearest object in every direction, for several lidars at once.
 
     Args:
-        ego_xy: objects in the robot's frame [N, M, 2] (m).
-        cells: of the objects, from `lidar_cells` [3, N, M].
-        num_groups: number of lidars, G.
-        num_bins: bins over the full circle, counter-clockwise from the robot's x axis.
-        max_dist: readings fall linearly to 0 at this distance [m]; None: they fall as exp(-gain d).
-        exp_gain: that gain [1/m].
-        alias: also light the two neighbouring bins, in proportion to where in its bin an object is.
+        ego_xy: Objects in the robot's frame [N, M, 2] (m).
+        cells: Cells of the objects, from `lidar_cells` [3, N, M].
+        num_groups: Number of lidars, G.
+        num_bins: Bins over the full circle, counter-clockwise from the robot's x axis.
+        max_dist: Readings fall linearly to 0 at this distance [m]; None: they fall as exp(-gain d).
+        exp_gain: The gain [1/m] if `max_dist` is None.
+        alias: An object also raises the two bins next to its own, in proportion to its position
+            within its bin.
 
     Returns:
         Readings in [0, 1], [N, G * num_bins].
@@ -67,7 +68,7 @@ def pseudo_lidar(
         reading = torch.exp(-exp_gain * distance)
     else:
         reading = torch.rsub(distance / max_dist, 1.0).relu_()
-    # In two steps: then straight behind, either way round, is half of the bins to the last digit.
+    # In two steps, so that ±π gives exactly half of the bins.
     turn = torch.atan2(y, x).div_(2 * math.pi).mul_(num_bins)
     bins = turn.floor()
     values = reading.unsqueeze(0)
@@ -84,7 +85,7 @@ def pseudo_lidar(
 
 
 def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
-    """All lidars of a configuration, as one block."""
+    """Return all lidars of a configuration as one block; no block if there is no lidar."""
     elements = [element for element in ELEMENTS if element.observed(config)]
     if not elements:
         return []
@@ -97,7 +98,7 @@ def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) ->
 
 
 def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[World], Tensor]:
-    """Buttons are not seen while their timer runs after a goal."""
+    """Set the columns of buttons to 0 while their timer runs after a goal."""
 
     def read_awake(world: World) -> Tensor:
         readings = read(world)
@@ -110,7 +111,7 @@ def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[W
 def _pseudo(
     config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
-    """Every object that any lidar sees, in one pass."""
+    """Return a function that reads all lidars in one pass over the objects that they see."""
     kinds = [element.kind for element in elements]
     seen = sorted(
         (slot, kinds.index(kind))
@@ -122,7 +123,7 @@ def _pseudo(
     slots, group = pairs.view(-1, 2).T.contiguous()
     at_origin = [kinds.index(kind) for kind in TASKS[config.task].at_origin if kind in kinds]
     group = torch.cat([group, group.new_tensor(at_origin)])
-    # The same at every step, but how many robots there are is known at the first.
+    # They are the same at every step; the number of robots is known at the first step.
     cells = cache(partial(lidar_cells, group, len(kinds), config.lidar_num_bins))
     all_seen = len(slots) == len(scene.names)
 
@@ -146,7 +147,7 @@ def _pseudo(
 
 
 def ray_directions(num_rays: int) -> Tensor:
-    """Unit vectors in a robot's xy plane, counter-clockwise from its x axis: [R, 3]."""
+    """Return R unit vectors in a robot's xy plane, counter-clockwise from its x axis: [R, 3]."""
     angle = 2 * math.pi * torch.arange(num_rays, dtype=torch.float64) / num_rays
     return torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], -1)
 
@@ -154,10 +155,10 @@ def ray_directions(num_rays: int) -> Tensor:
 def _natural(
     config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
-    """Rays that see one geom group each: exp(-distance), 0 for a miss.
+    """Return a function that casts rays, each at one geom group: exp(-distance), 0 for a miss.
 
-    Two peculiarities of the benchmark are kept: the goal's group is also that of the floor and of
-    the robot's limbs; and groups beyond MuJoCo's six (the circle's) are never seen.
+    Two peculiarities of the benchmark are kept: the floor and the robot's limbs have the goal's
+    group; groups beyond MuJoCo's six (the circle's) are never seen.
     """
     rays = ray_directions(config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))

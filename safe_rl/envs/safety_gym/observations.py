@@ -1,6 +1,6 @@
 """The observation: its components, their sizes, order and values.
 
-Components that are computed together are a block. The observation has all components in the
+Components that are computed together are a block. The components of the observation are in the
 alphabetical order of their names (paper section 4.1.4).
 """
 
@@ -34,7 +34,7 @@ def _plain(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[
 
 
 def _read(row: Reading, size: int, world: World) -> Tensor:
-    """The values of a reading [N, size]; an error if the width is another one."""
+    """Return the values of a reading [N, size]; ConfigError if their shape is wrong."""
     return world.require(f"The observation '{row.name}'", row.read(world), size)
 
 
@@ -50,10 +50,10 @@ class Observer(NamedTuple):
     """Computes the observations of the worlds of one scene.
 
     Attributes:
-        shapes: shape of every component, in the order of the flat observation.
-        columns: columns of every component in the flat observation.
-        read: world -> flat observation [N, n], float32.
-        bounds: lowest and highest value of every component.
+        shapes: Shape of every component, in the order of the flat observation.
+        columns: Columns of every component in the flat observation.
+        read: World -> flat observation [N, n], float32.
+        bounds: Lowest and highest value of every component.
     """
 
     shapes: Shapes
@@ -67,7 +67,7 @@ class Observer(NamedTuple):
         return sum(math.prod(shape) for shape in self.shapes.values())
 
     def split(self, flat: Tensor) -> dict[str, Tensor]:
-        """Views of a flat observation [N, n] by component, each [N, *shape]."""
+        """Return views of a flat observation [N, n] by component, each [N, *shape]."""
         return {
             name: flat[:, self.columns[name]].unflatten(1, shape)
             for name, shape in self.shapes.items()
@@ -75,7 +75,12 @@ class Observer(NamedTuple):
 
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
-    """Build the observer of a configuration; ConfigError for sensors the robot does not have."""
+    """Build the observer of a scene.
+
+    Raises:
+        ConfigError: If nothing is observed, two components have one name, or the robot lacks a
+            sensor, camera or joint that is observed.
+    """
     blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:
@@ -106,7 +111,7 @@ def make_observer(scene: Scene, device: torch.device) -> Observer:
 def observation_spec(
     config: SafetyGymConfig, observer: Observer, num_envs: int, device: torch.device | None
 ) -> TensorSpec:
-    """One flat vector, or every component in its own shape, each within its bounds."""
+    """Return the spec of one flat vector, or of every component in its shape, with bounds."""
     kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
     columns = torch.tensor([observer.bounds[name] for name in observer.columns]).T
     widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
@@ -120,10 +125,10 @@ def observation_spec(
 
 
 def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
-    """Spec of numbers within (low, high); numbers without bounds get very large ones."""
+    """Return the spec of numbers within (low, high); an infinite bound gets a very large one."""
     if bounds.isinf().all():
         return Unbounded(shape=shape, **kind)
-    # half as far as there are numbers, so that there is one for the width
+    # half of the largest number, so that the width of the range is finite
     far = torch.finfo(kind["dtype"]).max / 2
     low, high = (bound.clamp(-far, far).expand(shape).clone() for bound in bounds)
     return Bounded(low, high, shape=shape, **kind)

@@ -1,4 +1,4 @@
-"""Components of the observation besides lidars and camera: sensors, and the table of others.
+"""Components of the observation other than lidars and camera: sensors, and a table of the rest.
 
 Paper sections 4.1.1 and 4.1.4.
 """
@@ -23,12 +23,12 @@ class Reading(NamedTuple):
     """A row: one component of the observation.
 
     Attributes:
-        name: of the component.
-        present: whether a configuration has it.
-        size: number of values.
-        read: world -> [N, size].
-        touches: kinds whose contacts with the robot it reads.
-        bounds: lowest and highest value.
+        name: Name of the component.
+        present: Whether a configuration has it.
+        size: Number of values.
+        read: World -> [N, size].
+        touches: Kinds of objects whose contacts with the robot it reads.
+        bounds: Lowest and highest value.
     """
 
     name: str
@@ -66,7 +66,10 @@ def _freejoint_size(config: SafetyGymConfig, scene: Scene) -> int:
 
 
 def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
-    """A planar robot's coordinates relative to its start, so they do not depend on the origin."""
+    """Return a planar robot's coordinates in the frame of its start; others are unchanged.
+
+    Only if `moved`, the start's position is subtracted; velocities are only rotated.
+    """
     if not world.scene.planar:
         return vector
     start = world.start_pose if moved else torch.zeros_like(world.start_pose)
@@ -100,7 +103,7 @@ READINGS: list[Reading] = [
 
 
 def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint) -> list[int]:
-    """Sensors of one type on one type of joint."""
+    """Return the ids of the robot's sensors of one type on one type of joint."""
     model = scene.model
     return [
         i
@@ -122,7 +125,7 @@ def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
 
 
 def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
-    """Robot sensors: raw ones, hinge angles as (sin, cos), ball joints as rotation matrices."""
+    """Return the robot's sensors: raw values, hinges as (sin, cos), balls as rotation matrices."""
     if not config.observe_sensors:
         return []
     sensor, joint = mujoco.mjtSensor, mujoco.mjtJoint
@@ -130,8 +133,8 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -
         for i in _joint_sensors(scene, kind, joint.mjJNT_SLIDE):
             raise ConfigError(
                 f"'robot_base': {config.robot_base} has the sensor '{scene.model.sensor(i).name}' "
-                "on a slide joint, and observations must not depend on where the world's origin "
-                "is: remove the sensor, or set 'observe_sensors' to False."
+                "on a slide joint, but observations must not depend on the world's origin: remove "
+                "the sensor, or set 'observe_sensors' to False."
             )
     raw, angles, quaternions = _named_sensors(config, scene), [], []
     if config.sensors_hinge_joints:
@@ -140,7 +143,7 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -
     if config.sensors_ball_joints:
         raw += _joint_sensors(scene, sensor.mjSENS_BALLANGVEL, joint.mjJNT_BALL)
         quaternions += _joint_sensors(scene, sensor.mjSENS_BALLQUAT, joint.mjJNT_BALL)
-    # as in 2019, a sensor that is listed and of a joint is observed once, and as one of a joint
+    # as in 2019, a listed sensor that measures a joint is observed once, as one of a joint
     raw = [i for i in dict.fromkeys(raw) if i not in (*angles, *quaternions)]
     if not config.sensors_angle_components:
         raw, angles, quaternions = raw + angles + quaternions, [], []
@@ -163,7 +166,7 @@ def _sensor_block(
     convert: Callable[[Tensor], Tensor],
     device: torch.device,
 ) -> Block:
-    """Readings of sensors, converted to components of a shape, or as they are."""
+    """Return the block of some sensors; shape None keeps the size that a sensor has in MuJoCo."""
     shapes: Shapes = {model.sensor(i).name: shape or (int(model.sensor_dim[i]),) for i in sensors}
     spans = [(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in sensors]
     numbers = [column for span in spans for column in range(*span)]
@@ -172,7 +175,7 @@ def _sensor_block(
 
 
 def rotation_matrix(quaternion: Tensor) -> Tensor:
-    """Unit quaternions (w, x, y, z) [..., 4] as rotation matrices [..., 3, 3]."""
+    """Convert unit quaternions (w, x, y, z) [..., 4] to rotation matrices [..., 3, 3]."""
     w, x, y, z = quaternion.unbind(-1)
     rows = (
         *(w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),

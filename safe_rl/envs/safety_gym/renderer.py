@@ -1,6 +1,6 @@
 """Frames of an environment's worlds, with lidar halos, goal button, boundaries and costs.
 
-Positions in metres, in the world.
+Positions are in metres, in the world's frame.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, World
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25
-# of boundaries [m]; longer than any arena
+# Sizes of boundaries [m]; a wall along one boundary only is longer than any arena.
 WALL_HALF_WIDTH, WALL_HALF_HEIGHT, WALL_HALF_LENGTH = 0.02, 0.1, 20.0
 WALL_RGBA = (1.0, 0.4, 0.1, 0.3)
 GOAL_BUTTON_RGBA = (0.4, 0.4, 0.4, 0.25)
-# Share of its colour that a bin shows where it reads nothing, so that the ring can be seen.
+# Brightness of a bin whose reading is 0, so that the whole ring is visible.
 DIMMEST = 0.1
 
 
@@ -33,9 +33,9 @@ def lidar_halos(
     robot_pos: np.ndarray,
     robot_mat: np.ndarray,
 ) -> Iterator[Marker]:
-    """Rings of spheres above the robot, one per lidar, as bright as its readings in [0, 1]."""
+    """Yield a ring of spheres above the robot for each lidar, as bright as its readings [0, 1]."""
     radius, offset = config.render_lidar_radius, config.render_lidar_offset_init
-    # A pseudo-lidar's bin is a sector and is drawn at its middle, a natural one's is a ray.
+    # A bin of the pseudo-lidar is a sector, drawn at its middle; that of the natural one is a ray.
     middle = 0.5 if config.lidar_type == "pseudo" else 0.0
     for element in ELEMENTS:
         if element.kind not in readings:
@@ -56,13 +56,13 @@ def lidar_halos(
 
 
 def goal_button(config: SafetyGymConfig, button_pos: np.ndarray) -> Marker:
-    """A faint grey cylinder around the button that is the goal, centred at `button_pos` [3]."""
+    """Return a transparent grey cylinder around the goal button, centred at `button_pos` [3]."""
     radius = 2 * config.buttons_size
     return Marker(CYLINDER, (radius, radius, radius), button_pos, GOAL_BUTTON_RGBA)
 
 
 def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
-    """Low translucent walls at the boundaries."""
+    """Yield low translucent walls at the boundaries."""
     if not config.constrain_boundary:
         return
     halves = [config.boundary_x, config.boundary_y]
@@ -78,11 +78,11 @@ def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
 
 
 def cost_sphere(robot_pos: np.ndarray) -> Marker:
-    """A red sphere around a robot at `robot_pos` [3] that incurs a cost."""
+    """Return a red sphere around a robot at `robot_pos` [3] that has a cost."""
     return Marker(SPHERE, (COST_RADIUS,) * 3, robot_pos, COST_RGBA)
 
 
-# Largest share of a frame's width and height that the inset of the robot's camera takes.
+# Largest share of a frame's width and height for the inset of the robot's camera.
 INSET_SHARE = 1 / 3
 
 
@@ -110,11 +110,11 @@ class WorldRenderer:
         return frames
 
     def close(self) -> None:
-        """Free what OpenGL holds."""
+        """Free the resources of OpenGL."""
         self._display.close()
 
     def _readings(self) -> dict[str, Tensor]:
-        """Present lidar readings of all worlds by kind, [N, num_bins]."""
+        """Return the present lidar readings of all worlds by kind, [N, num_bins]."""
         readings: dict[str, Tensor] = {}
         for block in self._lidars:
             kinds = [name.removesuffix("_lidar") for name in block.shapes]
@@ -136,7 +136,7 @@ class WorldRenderer:
             yield cost_sphere(robot_pos)
 
     def _add_inset(self, frame: np.ndarray) -> None:
-        """Show the image of the robot's camera in a corner, if it is observed."""
+        """Draw the image of the robot's camera in a corner, if it is observed and rendered."""
         config = self._config
         if not (config.observe_vision and config.vision_render):
             return
@@ -149,7 +149,7 @@ class WorldRenderer:
 
 
 def _resize(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize by taking the nearest pixels."""
+    """Resize a picture by the nearest pixels."""
     lines = np.arange(height) * picture.shape[0] // height
     columns = np.arange(width) * picture.shape[1] // width
     return picture[lines[:, None], columns]

@@ -1,4 +1,4 @@
-"""Robots: reading and checking an MJCF file, and the copies of it in the folders of runs.
+"""Robots: load and check an MJCF file, and copy it to the folders of runs.
 
 A robot file has a body named "robot" at the top level of its world. The body stands upright and is
 placed by its root joint: a free joint, or slides along x and y and a hinge about z. The geom
@@ -21,16 +21,16 @@ from safe_rl.envs.errors import ConfigError, nearest
 
 
 def fingerprint(path: Path) -> str:
-    """Return a hash of the contents of a robot's files, whatever they are called."""
+    """Return a hash of the contents of a robot's files, which does not depend on their names."""
     contents = sorted(hashlib.sha256(file.read_bytes()).hexdigest() for file in robot_files(path))
     return hashlib.sha256(" ".join(contents).encode()).hexdigest()
 
 
 def robot_files(path: Path) -> list[Path]:
-    """Return an MJCF file and all files that it names and that exist, each once.
+    """Return an MJCF file and all existing files that it names, each once.
 
     Raises:
-        ConfigError: if one cannot be read.
+        ConfigError: If one cannot be read.
     """
     try:
         named = mujoco.mju_getXMLDependencies(str(path))
@@ -41,10 +41,10 @@ def robot_files(path: Path) -> list[Path]:
 
 BUNDLED = Path(__file__).parent / "robots"
 ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xml"))}
-# As the dictionaries of 2019 name them, from the folder of that package.
+# Paths in the dictionaries of 2019, relative to the folder of that package -> name.
 PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
 
-CONTROL_RANGE = (-1.0, 1.0)  # of actuators whose file gives none
+CONTROL_RANGE = (-1.0, 1.0)  # of actuators without a range in the file
 _PLANAR_JOINTS = (
     mujoco.mjtJoint.mjJNT_SLIDE,
     mujoco.mjtJoint.mjJNT_SLIDE,
@@ -55,13 +55,13 @@ _PLANAR_AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot that an environment can be built around.
+    """A robot for which a world can be built.
 
     Attributes:
-        spec: what its file describes, to build the world in.
-        num_bodies: its bodies, the first ones of the world after the world body itself.
-        num_sensors: its sensors, the first ones of the world.
-        planar: whether the root is (x, y, yaw) instead of a free joint.
+        spec: MJCF specification of its file, to which the world is added.
+        num_bodies: Number of its bodies, the first ones of the world after the world body.
+        num_sensors: Number of its sensors, the first ones of the world.
+        planar: Whether the root is (x, y, yaw) instead of a free joint.
     """
 
     spec: mujoco.MjSpec
@@ -75,7 +75,7 @@ def _refused(path: Path, what: str) -> ConfigError:
 
 
 def robot_path(base: str) -> Path:
-    """Return the file of a name in `ROBOTS`, or of a path."""
+    """Return the file of a robot, given by its name in `ROBOTS` or its path."""
     return ROBOTS.get(base, Path(base))
 
 
@@ -83,13 +83,13 @@ def load_robot(base: str) -> Robot:
     """Load a robot, by name or file, and check that it can be placed, moved and stepped.
 
     Raises:
-        ConfigError: if MuJoCo cannot load the file, or the file lacks what an environment needs.
+        ConfigError: If MuJoCo cannot load the file, or an environment cannot use the robot.
     """
     path = robot_path(base)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         for key in list(spec.keys):
-            spec.delete(key)  # a pose of the robot alone is no pose of the world
+            spec.delete(key)  # a pose of the robot alone does not fit the world
         model = spec.copy().compile()
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
@@ -105,7 +105,7 @@ def _check_ranges(model: mujoco.MjModel, path: Path) -> None:
     for (low, high), limited in zip(
         model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
     ):
-        # MuJoCo takes a reversed range for none.
+        # MuJoCo treats a reversed range as no range.
         if not math.isfinite(high - low) or low > high or (limited and low == high):
             raise _refused(
                 path,
@@ -118,33 +118,33 @@ def _check_body(model: mujoco.MjModel, path: Path) -> None:
     names = [model.body(i).name for i in range(1, model.nbody)]
     if "robot" not in names:
         hint = nearest("robot", names) or f" Its bodies are {names}."
-        raise _refused(path, f"has no body named 'robot'.{hint} Name the robot's root body so.")
+        raise _refused(path, f"has no body named 'robot'.{hint} Give the root body this name.")
     body = model.body("robot").id
     if model.body_parentid[body] != 0:
         parent = model.body(model.body_parentid[body]).name
-        raise _refused(path, f"has its body 'robot' inside '{parent}': put it into the worldbody.")
+        raise _refused(path, f"has its body 'robot' inside '{parent}': move it to the worldbody.")
     if model.body_quat[body].tolist() != [1, 0, 0, 0]:
         raise _refused(
             path,
-            "turns its body 'robot': a reset sets the body upright with a random yaw, so give the "
-            "rotation to geoms or child bodies instead.",
+            "rotates its body 'robot': a reset sets the body upright with a random yaw, so give "
+            "the rotation to geoms or child bodies instead.",
         )
     if model.nu == 0:
-        raise _refused(path, "has no actuators: add at least one, for there is no action without.")
+        raise _refused(path, "has no actuators: add at least one, which an action can control.")
     if model.nmocap:
         raise _refused(
-            path, "has mocap bodies, which no robot can move: make them ordinary bodies."
+            path, "has mocap bodies, which a robot cannot move: make them ordinary bodies."
         )
 
 
 def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
-    """Whether the root is (slide x, slide y, hinge z); else it must be a free joint."""
+    """Whether the root is (slide x, slide y, hinge z); otherwise it must be a free joint."""
     body = model.body("robot").id
     first, number = model.body_jntadr[body], model.body_jntnum[body]
     joints = slice(first, first + min(number, 3))
     types = tuple(model.jnt_type[joints])
     if first > 0:
-        raise _refused(path, "has joints before those of the body 'robot': put that body first.")
+        raise _refused(path, "has joints before those of the body 'robot': put this body first.")
     if types[:1] == (mujoco.mjtJoint.mjJNT_FREE,):
         return False
     if types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES:
@@ -157,14 +157,14 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
     if any(origin):
         raise _refused(
             path,
-            "moves its planar root away from the origin: x and y of the body 'robot' and of its "
+            "has its planar root away from the origin: x and y of the body 'robot' and of its "
             "joints, and their 'ref', must be 0, so that the joints are the robot's coordinates.",
         )
     return True
 
 
 def own_robot(keys: Mapping[str, Any]) -> Path | None:
-    """Return the file of the robot that keys name, if it is none of the bundled."""
+    """Return the file of the robot in a mapping of keys; None for a bundled robot."""
     base = str(keys.get("robot_base", "car"))
     path = robot_path(base)
     is_bundled = path.parent == BUNDLED or (base in PATHS_OF_2019 and not path.is_file())
@@ -172,18 +172,18 @@ def own_robot(keys: Mapping[str, Any]) -> Path | None:
 
 
 def copy_robot(path: Path, folder: Path) -> Path:
-    """Copy a robot's file and all files that it names into a folder: the path of the copy.
+    """Copy a robot's file and all files that it names to a folder; return the path of the copy.
 
     Raises:
-        ConfigError: if it names files that do not lie in its own folder or below.
-        OSError: if they cannot be copied.
+        ConfigError: If it names files outside its own folder, or the copy is not the same robot.
+        OSError: If the files cannot be copied.
     """
     home = path.parent.resolve()
-    # the robot's own file may be reached by a link, others only where they are
+    # the robot's own file may be a link; links of other files are resolved
     files = {home / path.name, *(file.resolve() for file in robot_files(path) if file != path)}
     for outside in (file for file in files if not file.is_relative_to(home)):
         raise ConfigError(
-            f"'robot_base': {path} names {outside}, which is outside of its own folder, {home}."
+            f"'robot_base': {path} names {outside}, which is outside its own folder, {home}."
         )
     for file in files:
         copy = folder / file.relative_to(home)
@@ -197,7 +197,7 @@ def copy_robot(path: Path, folder: Path) -> Path:
 
 
 def is_robot(path: Path, folder: Path, content: str) -> bool:
-    """Whether a robot's files have a fingerprint, and all of them are in a folder."""
+    """Whether a robot's files have the fingerprint `content` and are all in a folder."""
     inside = folder.resolve()
     return fingerprint(path) == content and all(
         file.resolve().is_relative_to(inside) for file in robot_files(path)

@@ -1,4 +1,4 @@
-"""State of the worlds: named views of it, poses, reading and writing it for resuming and tests."""
+"""State of the worlds: named views, poses, and reading and writing it for resuming and tests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def make_world(scene: Scene, physics: Physics) -> World:
     real: dict[str, Any] = {"dtype": physics.dtype, "device": physics.device}
     whole: dict[str, Any] = {"dtype": torch.int64, "device": physics.device}
     robot, model = scene.robot_body, scene.model
-    # In memory all x, then all y, then all z: passes over one coordinate are over one piece.
+    # In memory all x are first, then all y, then all z, so that each coordinate is contiguous.
     positions = torch.zeros(3, num_envs, num_objects, **real).movedim(0, -1)
     positions[..., 2] = torch.tensor(scene.heights, **real)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
@@ -46,7 +46,7 @@ def make_world(scene: Scene, physics: Physics) -> World:
         ctrl=physics.ctrl,
         sensordata=physics.sensordata,
         target_travel=torch.tensor(scene.travel, **real),
-        # Guided objects float at twice the height they start at, see `bodies.add_targets`.
+        # The targets of guided objects are at twice the height of the objects' centres.
         target_height=2 * positions[0, scene.guided, 2],
         layout=torch.zeros(num_envs, 1 + num_objects, 2, **real),
         start_pose=torch.zeros(num_envs, 3, **real),
@@ -64,12 +64,12 @@ def refresh(world: World) -> None:
 
 
 def put(target: Tensor, mask: Tensor, values: Tensor) -> None:
-    """Write values [N, ...] into a tensor [N, ...] where a mask [N] holds."""
+    """Write values [N, ...] to a tensor [N, ...] in the rows of a mask [N]."""
     target.copy_(torch.where(mask.view(-1, *[1] * (target.ndim - 1)), values, target))
 
 
 def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:
-    """Write the robot's and the free bodies' poses [N, 1 + F] into the state of some worlds."""
+    """Set the poses of robot and free bodies in the worlds of a mask, with yaws [N, 1 + F]."""
     scene, physics = world.scene, world.physics
     pose = torch.cat([world.layout[:, 0], yaws[:, :1]], -1)
     put(world.start_pose, mask, pose)
@@ -87,7 +87,7 @@ def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:
 
 
 def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
-    """Mocap positions before each of the coming substeps [N, S, nmocap, 3]."""
+    """Return the mocap positions before each of the next substeps [N, S, nmocap, 3]."""
     scene = world.scene
     guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
     targets = circling_targets(
@@ -109,8 +109,8 @@ def place_mocaps(world: World) -> None:
         span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
         physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
     if scene.num_targets:
-        # Where they were before the last substep, which is what the state was computed with; at
-        # the start they stand where their objects do.
+        # Before the last substep they were here, and the state was computed from that; at the
+        # start they are at the positions of their objects.
         last = (physics.time - physics.timestep).clamp(min=0.0)
         targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
         centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
@@ -121,7 +121,7 @@ def place_mocaps(world: World) -> None:
 
 
 def point_goal_at_button(world: World, mask: Tensor) -> None:
-    """Set the goal's position to that of the goal button, in some worlds."""
+    """Set the goal's position to that of the goal button in the worlds of a mask."""
     number = world.goal_button.clamp(min=0).view(-1, 1, 1).expand(-1, 1, 3)
     button = world.at("buttons").gather(1, number)[:, 0]
     put(world.positions[:, world.scene.slots["goal"].start], mask, button)
@@ -130,7 +130,7 @@ def point_goal_at_button(world: World, mask: Tensor) -> None:
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
-# Without the last control, sensors that feel the actuators differ until the next step.
+# Without the last control, sensors that depend on actuators differ until the next step.
 OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
 
 
@@ -146,7 +146,7 @@ def read_state(world: World) -> TensorDict:
 
 
 def write_state(world: World, state: TensorDictBase) -> None:
-    """Set N worlds to a state that `check_worlds` accepted, and compute all that depends on it."""
+    """Set N worlds to a state that `check_worlds` accepted, and compute all outputs."""
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
@@ -175,11 +175,11 @@ def write_state(world: World, state: TensorDictBase) -> None:
 
 
 def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) -> None:
-    """Check a state before it is set, against the `expected` present one.
+    """Check a state before it is set, by comparison with the present one, `expected`.
 
     Raises:
-        KeyError: if a key is missing.
-        ValueError: if it does not fit, or there is no such goal button.
+        KeyError: If a key is missing.
+        ValueError: If a shape or type does not fit, or a goal button does not exist.
     """
     check_state(expected, state, OPTIONAL_KEYS)
     button, number = state["goal_button"], world.scene.config.buttons_num

@@ -43,14 +43,14 @@ def _extents(half: float) -> Values:
 
 
 def _level(half: float, constrained: str, observed: str, **numbers: int) -> Values:
-    """How far placements reach, kinds that cost something, kinds with a lidar, and how many."""
+    """Return the extent of placements, constraints, lidars and numbers of objects of a level."""
     flags = [f"constrain_{kind}" for kind in constrained.split()]
     flags += [f"observe_{kind}" for kind in observed.split()]
     return {**_extents(half), **numbers, **dict.fromkeys(flags, True)}
 
 
 _BUTTON_COSTS = "hazards buttons gremlins"
-# For each task: what all levels share, then what each level has.
+# For each task: the values of all levels, then those of each level.
 _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
     "Goal": (
         {"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305, "hazards_size": 0.2,
@@ -81,7 +81,7 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
     ),
 }  # fmt: skip
 
-# A robot's own values (the Car's smaller box) go before the task's.
+# A robot's own values (the Car's smaller box) override those of the task.
 SUITE: dict[str, SafetyGymConfig] = {
     f"{robot}{task}{level}": SafetyGymConfig(**{**_COMMON, **shared, **levels[level], **own})
     for robot, own in _ROBOTS.items()
@@ -89,13 +89,14 @@ SUITE: dict[str, SafetyGymConfig] = {
     for level in range(3)
 }
 
-# Not part of the benchmark: to see whether a robot can be moved at all.
+# Not part of the benchmark: tasks to see whether a robot can be moved at all.
 _DEBUG: dict[str, Values] = {
     "Run": {"task": "x", "robot_rot": 0.0},
     "Circle": {"task": "circle", "observe_circle": True, "lidar_max_dist": 6.0},
 }
 # Circle of the CPO paper (Achiam et al. 2017) and Run of Bullet-Safety-Gym (Gronauer 2022), with
-# the sizes of Safety-Gymnasium 1.0, whose Run has no limit of speed: here two thirds of Point's.
+# the sizes of Safety-Gymnasium 1.0. Its Run has no speed limit; here it is two thirds of Point's
+# highest speed.
 _WITHIN: Values = {"num_steps": 500, "robot_keepout": 0.0, "constrain_boundary": True}
 _CIRCLE: Values = {**_WITHIN, "robot_placements": ((-0.8, -0.8, 0.8, 0.8),), "boundary_x": 1.125}
 _BOUNDED: dict[str, Values] = {
@@ -119,7 +120,7 @@ _DEBUG_SUITE = {
 }
 _WITH_VISION: Values = {"observe_vision": True, "observation_flatten": False}
 
-# Everything that has a name but does not count as the benchmark.
+# Named environments that are not part of the benchmark.
 EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
     f"{name}Vision": config.replace(**_WITH_VISION)
     for name, config in (SUITE | _DEBUG_SUITE).items()
@@ -127,13 +128,14 @@ EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
 
 
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
-    """Return the configuration of a name, a mapping of keys, or a configuration.
+    """Return the checked configuration of a name, a mapping of keys, or a configuration.
 
     Args:
         env: "PointGoal1", "Safexp-PointGoal1-v0", a flat mapping, or a `SafetyGymConfig`.
 
     Raises:
-        ConfigError: for an unknown name (the nearest one is named), or an invalid configuration.
+        ConfigError: For an unknown name (the message suggests a known one), or an invalid
+            configuration.
 
     Examples:
         >>> resolve("Safexp-CarPush2-v0").pillars_num
@@ -149,17 +151,17 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError(
             f"Unknown environment '{env}'.{nearest(name, named)} The suite has "
             "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
-            "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and a "
-            "{name}Vision of every one."
+            "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and {name}Vision "
+            "for each of them."
         )
     return named[name]
 
 
 def check(config: SafetyGymConfig) -> SafetyGymConfig:
-    """Return a configuration that an environment can be made of.
+    """Return a configuration from which an environment can be made.
 
     Raises:
-        ConfigError: naming the first key that is wrong.
+        ConfigError: If keys do not fit together; the message names the first wrong key.
     """
     if config.task not in TASKS:
         hint = nearest(config.task, TASKS)

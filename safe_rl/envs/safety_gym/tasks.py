@@ -4,8 +4,8 @@ Dense rewards are differences of measurements between two steps. The environment
 measurement, and measures again when a new goal is drawn. So a change of goal does not change the
 reward.
 
-Commands that only compose a configuration also read the table and must start quickly. So functions
-here import torch only if methods of tensors are not enough.
+Commands that only compose a configuration also import this table and must start quickly. So torch
+is imported inside the functions that need more than methods of tensors.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _CENTRE = 1e-12  # [m]
 
 
 def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
-    """Angular motion [N] about the origin, discounted by the distance to the circle [m]."""
+    """Return the speed [N] about the origin, reduced by the distance to the circle [m]."""
     (x, y), (u, v) = com_xy.unbind(-1), velocity_xy.unbind(-1)
     r = (x**2 + y**2).sqrt()
-    # at the very centre, where a round robot may start, there is no motion about it
+    # in the centre, where a robot may start, the numerator is 0
     return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + (r - radius).abs())
 
 
@@ -50,12 +50,12 @@ class Task(NamedTuple):
 
     Attributes:
         reward: (config, world, measured one step before [N, D], measured now [N, D]) -> [N].
-        measure: measurements whose differences are the reward, [N, D].
+        measure: Measurements whose differences are the reward, world -> [N, D].
         met: (config, world, measured now) -> bool [N], for tasks with goals.
-        next_goal: how a new goal is drawn, for tasks with goals.
-        elements: kinds of which the task brings one object each.
-        touches: kinds whose contacts with the robot it reads.
-        at_origin: kinds of which it brings no object, and which are observed at the origin.
+        next_goal: How a new goal is drawn, for tasks with goals.
+        elements: Kinds of which the task adds one object each.
+        touches: Kinds of objects whose contacts with the robot it reads.
+        at_origin: Kinds without an object that are observed at the origin.
     """
 
     reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
@@ -137,7 +137,7 @@ BUILT_IN = frozenset(TASKS)
 
 
 def goal_is_button(task: str) -> bool:
-    """Whether the goal of a task is wherever its goal button is."""
+    """Whether the goal of a task is at the goal button."""
     return TASKS[task].next_goal is NextGoal.BUTTON
 
 
@@ -149,7 +149,11 @@ def dense_reward(
     now: Tensor,
     failed: Tensor,
 ) -> Tensor:
-    """Reward [N] without the bonus for a goal, clipped to ±`reward_clip`."""
+    """Return the reward [N] without the bonus for a goal, clipped to ±`reward_clip`.
+
+    Raises:
+        ConfigError: If a registered task's reward has a wrong shape or is NaN.
+    """
     reward = world.require(
         f"'reward' of task '{config.task}'", task.reward(config, world, before, now)
     )
@@ -169,7 +173,7 @@ def dense_reward(
 def goals_met(
     task: Task, config: SafetyGymConfig, world: World, now: Tensor, failed: Tensor
 ) -> Tensor:
-    """Which worlds meet their goals: bool [N], for tasks with goals; failed ones do not."""
+    """Return which worlds meet their goals, bool [N], for tasks with goals; failed ones do not."""
     assert task.met is not None
     met = world.require(f"'met' of task '{config.task}'", task.met(config, world, now))
     return (met > 0) & ~failed

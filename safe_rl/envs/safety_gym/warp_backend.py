@@ -15,10 +15,10 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.extras import require_extra
 
-# The trial that finds out how many contacts there are.
+# Size of the trial that counts contacts.
 TRIAL_WORLDS, TRIAL_STEPS = 32, 50
 _FEWEST_CONTACTS, _FEWEST_CONSTRAINTS = 32, 128
-_NEARLY = 1e-3  # m: what just does not touch there may do so here
+_NEARLY = 1e-3  # margin of geoms in the trial [m], because contacts on the device differ a little
 
 
 def make_warp_physics(
@@ -28,18 +28,18 @@ def make_warp_physics(
     device: torch.device | None,
     env_class: Any,
 ) -> Physics:
-    """Build the physics of `physics` "warp".
+    """Build the physics for the value "warp" of the key `physics`.
 
     Args:
-        config: the environment.
-        model: its compiled world.
-        num_envs: number of worlds, N.
-        device: device of the worlds; None is the CPU.
+        config: The configuration of the environment.
+        model: Its compiled world.
+        num_envs: Number of worlds, N.
+        device: Device of the worlds; None is the CPU.
         env_class: `SafetyGymEnv`, for a trial on the CPU.
 
     Raises:
-        ConfigError: if the robot has something that MuJoCo Warp lacks, or for another device.
-        ModuleNotFoundError: if it is not installed.
+        ConfigError: If MuJoCo Warp does not support the robot, or for an unsupported device.
+        ModuleNotFoundError: If MuJoCo Warp is not installed.
     """
     device = torch.device("cpu") if device is None else device
     if device.type not in ("cpu", "cuda"):
@@ -56,14 +56,14 @@ def make_warp_physics(
         return WarpPhysics(model, num_envs, device, contacts=room[0], constraints=room[1])
     except (NotImplementedError, ValueError) as error:
         raise ConfigError(
-            f"'physics' warp does not take the robot {config.robot_base!r}: {error} Use 'physics' "
-            "cpu."
+            f"'physics' warp does not support the robot {config.robot_base!r}: {error} Use "
+            "'physics' cpu."
         ) from error
 
 
 @functools.lru_cache(maxsize=64)
 def most_contacts(config: SafetyGymConfig, env_class: Any) -> tuple[int, int]:
-    """Largest numbers of contacts and of rows of constraints in a trial of random actions."""
+    """Return the most contacts and constraint rows of a world in a trial of random actions."""
 
     class Trial(env_class):
         def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
@@ -84,5 +84,5 @@ def most_contacts(config: SafetyGymConfig, env_class: Any) -> tuple[int, int]:
 
 
 def _power_of_two(number: float) -> int:
-    """The next one: kernels are compiled for sizes, of which there should be few."""
+    """Round up to a power of two, because kernels are compiled once for each size."""
     return 1 << (max(1, int(number)) - 1).bit_length()

@@ -20,23 +20,25 @@ class Scene:
     """A compiled world, and the indices of its objects.
 
     Attributes:
-        config: the configuration it was built from.
-        model: the compiled model.
-        names: name of every object, by slot; slots are the M of `[N, M, …]` tensors.
-        slots: slots of each kind that has objects.
-        kinds: names of all kinds, also of those without.
+        config: The configuration from which it was built.
+        model: The compiled model.
+        names: Name of every object, by slot. Slots are the index M of `[N, M, …]` tensors.
+        slots: Slots of each kind that has objects.
+        kinds: Names of all kinds, also of those without objects.
         heights: z of every object's centre [m], by slot.
-        num_free: slots below this are free bodies, 7 `qpos` and 6 `qvel` each after the robot's.
-        num_mocap_slots: that many slots from `num_free` on are mocap bodies (after the targets').
-        guided: slots of the bodies that are welded to a target which runs in a circle.
-        num_targets: mocap bodies that those are welded to; the first ones.
-        travel: radius of each target's circle [m], by guided slot.
-        robot_body: body id of the robot's root.
-        robot_sensors: number of the robot file's own sensors, which come first.
-        robot_nq, robot_nv: the robot's share of `qpos` and `qvel`, which comes first.
-        planar: whether the root is (x, y, yaw) instead of a free joint.
-        oriented_body: body id of the part that `reward_orientation` looks at.
-        free_bodies: body ids of the free slots.
+        num_free: Slots below this number are free bodies. Each has 7 columns of `qpos` and 6 of
+            `qvel`, after the robot's.
+        num_mocap_slots: Number of slots from `num_free` on that are mocap bodies; in MuJoCo these
+            come after the targets.
+        guided: Slots of the bodies that are welded to a target which moves in a circle.
+        num_targets: Number of those targets, the first mocap bodies.
+        travel: Radius of each target's circle [m], by guided slot.
+        robot_body: Body id of the robot's root.
+        robot_sensors: Number of sensors in the robot's file, which come first.
+        robot_nq, robot_nv: Number of the robot's columns in `qpos` and `qvel`, which come first.
+        planar: Whether the root is (x, y, yaw) instead of a free joint.
+        oriented_body: Body id of the robot's part for `reward_orientation`.
+        free_bodies: Body ids of the free slots.
         contacts: `sensordata` columns of each kind's contact counts with the robot.
     """
 
@@ -73,23 +75,25 @@ class World:
     """N worlds of one scene; M objects by slot, K of one kind. Metres, seconds, float64.
 
     Attributes:
-        robot_pos, robot_xy: position of the robot body [N, 3], and where it is on the floor [N, 2].
-        robot_mat: its rotation, columns are its axes in the world [N, 3, 3].
-        com: centre of mass of the robot with its limbs [N, 3].
-        up: z component of the z axis of the body that `reward_orientation` looks at [N].
-        robot_vel: linear velocity of the robot body [N, 3].
-        positions: centres of all objects [N, M, 3], brought up to date by `refresh`; not
-            contiguous, so `flatten` them instead of asking for a `view`.
-        objects: the same by kind, [N, K, 3]; also of what a task observes at the origin.
-        velocities: linear velocities of the free bodies [N, F, 3].
-        contacts: contact points of the robot with each object of a kind, [N, K].
-        qpos, qvel, ctrl, sensordata: as MuJoCo has them, [N, ·].
-        target_travel, target_height: of the circles that guided objects run on [G] (m).
-        layout: positions at the start of the episode and of the newest goal [N, 1 + M, 2].
+        scene: The compiled world.
+        physics: The backend that runs the simulations.
+        robot_pos, robot_xy: Position of the robot body [N, 3], and its x and y [N, 2].
+        robot_mat: Its rotation; columns are its axes in the world [N, 3, 3].
+        com: Centre of mass of the robot with its limbs [N, 3].
+        up: z component of the z axis of the body for `reward_orientation` [N].
+        robot_vel: Linear velocity of the robot body [N, 3].
+        positions: Centres of all objects [N, M, 3], updated by `refresh`. They are not contiguous,
+            so use `flatten` instead of `view`.
+        objects: The same by kind, [N, K, 3]; also kinds that a task observes at the origin.
+        velocities: Linear velocities of the free bodies [N, F, 3].
+        contacts: Number of contact points of the robot with each object of a kind, [N, K].
+        qpos, qvel, ctrl, sensordata: The arrays of MuJoCo, [N, ·].
+        target_travel, target_height: Radius and height of the targets of guided objects [G] (m).
+        layout: Positions at the start of the episode, and of the newest goal [N, 1 + M, 2].
         start_pose: (x, y, yaw) of the robot at the start of the episode [N, 3].
-        goal_button: index of the goal button, -1 where there is none, int64 [N].
-        buttons_timer: steps until the buttons wake up, int64 [N].
-        step_count: steps taken in this episode, int64 [N].
+        goal_button: Index of the goal button, -1 if there is none, int64 [N].
+        buttons_timer: Steps until buttons have an effect again, int64 [N].
+        step_count: Steps taken in this episode, int64 [N].
     """
 
     scene: Scene
@@ -120,14 +124,14 @@ class World:
         """Return the positions of one kind's objects [N, K, 3], a view; K may be 0.
 
         Raises:
-            ConfigError: here and below, if there is no such kind.
+            ConfigError: Here and in the next methods, if the kind does not exist.
         """
         if kind in self.objects:
             return self.objects[kind]
         return self.positions[:, self._slots(kind)]
 
     def start_of(self, kind: str) -> Tensor:
-        """Return where they were at the start of the episode [N, K, 2], a view."""
+        """Return one kind's positions at the start of the episode [N, K, 2], a view."""
         slots = self._slots(kind)
         return self.layout[:, 1 + slots.start : 1 + slots.stop]
 
@@ -136,10 +140,10 @@ class World:
         return self.velocities[:, self._slots(kind)]
 
     def contacts_with(self, kind: str) -> Tensor:
-        """Return the robot's contact points with each of one kind's objects [N, K], a view.
+        """Return the number of the robot's contacts with each object of a kind [N, K], a view.
 
         Raises:
-            KeyError: if nothing counts them.
+            KeyError: If they are not counted.
         """
         if kind not in self.contacts and kind in self.scene.slots:
             raise KeyError(
@@ -151,7 +155,7 @@ class World:
         return self.sensordata[:, self._slots(kind)]
 
     def require(self, what: str, values: Any, *size: int) -> Tensor:
-        """Return values of the worlds; ConfigError unless they are a tensor [N, *size]."""
+        """Return values unchanged; ConfigError unless they are a tensor [N, *size]."""
         shape = (len(self.step_count), *size)
         if isinstance(values, Tensor) and values.shape == shape:
             return values
@@ -170,12 +174,12 @@ class World:
 
 
 class Block(NamedTuple):
-    """Components that are computed together.
+    """Components of the observation that are computed together.
 
     Attributes:
-        shapes: shape of each component, in the order of the columns of `read`.
-        read: world -> [N, total size].
-        bounds: lowest and highest value of all of them.
+        shapes: Shape of each component, in the order of the columns of `read`.
+        read: World -> [N, total size].
+        bounds: Lowest and highest value of all of them.
     """
 
     shapes: Shapes
