@@ -42,30 +42,3 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
     """Rotations about z by yaw [...] as quaternions (w, x, y, z) [..., 4]."""
     zero = torch.zeros_like(yaw)
     return torch.stack([torch.cos(yaw / 2), zero, zero, torch.sin(yaw / 2)], -1)
-
-
-def circling_targets(
-    centres: Tensor,
-    time: Tensor,
-    travel: Tensor | float,
-    height: Tensor | float,
-    timestep: float,
-    num_substeps: int,
-) -> Tensor:
-    """Positions of the gremlins' targets before each of S substeps: [N, S, K, 3].
-
-    Args:
-        centres: Positions of the gremlins in the layout [N, K, 2].
-        time: Time before the first substep [N] (s); at 0 targets are at +travel along y.
-        travel: Radius of the circle [m], for all or for each [K].
-        height: z of the targets [m], for all or for each [K].
-        timestep: Length of a substep [s].
-        num_substeps: Number of substeps, S.
-    """
-    steps = torch.arange(num_substeps, dtype=time.dtype, device=time.device)
-    phase = (time.unsqueeze(-1) + timestep * steps)[..., None]
-    radius = torch.as_tensor(travel, dtype=time.dtype, device=time.device).unsqueeze(-1)
-    offset = radius * torch.stack([torch.sin(phase), torch.cos(phase)], -1)
-    targets = centres.unsqueeze(1) + offset
-    z = torch.as_tensor(height, dtype=time.dtype, device=time.device).expand(targets.shape[:-1])
-    return torch.cat([targets, z.unsqueeze(-1)], -1)

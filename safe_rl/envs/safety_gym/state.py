@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs.physics import Physics
-from safe_rl.envs.safety_gym.geometry import circling_targets, yaw_quaternion
+from safe_rl.envs.safety_gym.geometry import yaw_quaternion
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
 from safe_rl.envs.simulated import check_state
@@ -87,19 +87,20 @@ def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:
 
 
 def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
-    """Return the mocap positions before each of the next substeps [N, S, nmocap, 3]."""
-    scene = world.scene
-    guided = slice(1 + scene.guided.start, 1 + scene.guided.stop)
-    targets = circling_targets(
-        world.layout[:, guided],
-        time,
-        world.target_travel,
-        world.target_height,
-        world.physics.timestep,
-        num_substeps,
-    )
-    static = world.physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
-    return torch.cat([targets, static], 2)
+    """Return the mocap positions before each of S substeps [N, S, nmocap, 3].
+
+    The gremlins' targets move in circles, from +y at time 0; `time` is that of the first substep
+    [N] (s).
+    """
+    scene, physics = world.scene, world.physics
+    steps = torch.arange(num_substeps, dtype=time.dtype, device=time.device)
+    phase = (time.unsqueeze(-1) + physics.timestep * steps)[..., None]
+    circle = torch.stack([torch.sin(phase), torch.cos(phase)], -1)
+    centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]
+    xy = centres.unsqueeze(1) + world.target_travel.unsqueeze(-1) * circle
+    z = world.target_height.expand(xy.shape[:-1]).unsqueeze(-1)
+    static = physics.mocap_pos[:, None, scene.num_targets :].expand(-1, num_substeps, -1, -1)
+    return torch.cat([torch.cat([xy, z], -1), static], 2)
 
 
 def place_mocaps(world: World) -> None:
