@@ -15,9 +15,21 @@ from torch import Tensor
 
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import ELEMENTS, NUM_RAY_GROUPS, Element
-from safe_rl.envs.safety_gym.geometry import floor_to_ego
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Block, Scene, World
+
+
+def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
+    """Transform points on the floor [N, M, 2] into the robot's frame, without z: [N, M, 2].
+
+    In memory all x are before all y, which makes later operations on one coordinate faster.
+    """
+    robot_xy, robot_z = robot_pos.split([2, 1], -1)
+    x, y = (xy - robot_xy.unsqueeze(1)).unbind(-1)
+    axes = robot_mat[..., :2].permute(1, 2, 0).contiguous()
+    along_x, along_y, along_z = axes.unsqueeze(-1).unbind(0)
+    ego = torch.addcmul(x * along_x, y, along_y)
+    return ego.addcmul_(robot_z, along_z, value=-1).movedim(0, -1)
 
 
 def _num_laps(num_bins: int) -> int:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.geometry import compass, distance, to_ego
-from safe_rl.envs.safety_gym.tasks import TASKS
+from safe_rl.envs.safety_gym.tasks import TASKS, goal_distance
 from safe_rl.envs.safety_gym.world import UNBOUNDED, Block, Bounds, Scene, Shapes, World
 
 
@@ -39,21 +38,12 @@ class Reading(NamedTuple):
     bounds: Bounds = UNBOUNDED
 
 
-def _ego(world: World, kind: str) -> Tensor:
-    return to_ego(world.at(kind), world.robot_pos, world.robot_mat)
-
-
-def _compass_to(kind: str) -> Callable[[World], Tensor]:
-    return lambda w: compass(_ego(w, kind), w.scene.config.compass_shape).flatten(1)
-
-
-def _goal_closeness(world: World) -> Tensor:
-    to_goal = distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
-    return torch.exp(-to_goal)
-
-
-def _remaining(world: World) -> Tensor:
-    return (world.step_count / world.scene.config.num_steps).unsqueeze(-1)
+def _compass(world: World, kind: str) -> Tensor:
+    """Return nearly unit vectors to a kind's objects in the robot's frame, flattened [N, D]."""
+    ego = (world.at(kind) - world.robot_pos.unsqueeze(-2)) @ world.robot_mat
+    vector = ego[..., : world.scene.config.compass_shape]
+    length = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    return (vector / (length + 1e-3)).flatten(1)
 
 
 def _freejoint_size(config: SafetyGymConfig, scene: Scene) -> int:
@@ -86,12 +76,13 @@ def _has(config: SafetyGymConfig, element: str) -> bool:
 
 READINGS: list[Reading] = [
     Reading("goal_compass", lambda c: c.observe_goal_comp and _has(c, "goal"),
-            lambda c, s: c.compass_shape, _compass_to("goal"), bounds=(-1.0, 1.0)),
+            lambda c, s: c.compass_shape, lambda w: _compass(w, "goal"), bounds=(-1.0, 1.0)),
     Reading("box_compass", lambda c: c.observe_box_comp and _has(c, "box"),
-            lambda c, s: c.compass_shape, _compass_to("box"), bounds=(-1.0, 1.0)),
+            lambda c, s: c.compass_shape, lambda w: _compass(w, "box"), bounds=(-1.0, 1.0)),
     Reading("goal_dist", lambda c: c.observe_goal_dist and _has(c, "goal"),
-            lambda c, s: 1, _goal_closeness, bounds=(0.0, 1.0)),
-    Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1, _remaining),
+            lambda c, s: 1, lambda w: torch.exp(-goal_distance(w)), bounds=(0.0, 1.0)),
+    Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1,
+            lambda w: (w.step_count / w.scene.config.num_steps).unsqueeze(-1)),
     Reading("com", lambda c: c.observe_com, lambda c, s: 3, lambda w: w.com),
     Reading("ctrl", lambda c: c.observe_ctrl, lambda c, s: s.model.nu, lambda w: w.ctrl),
     Reading("freejoint", lambda c: c.observe_freejoint, _freejoint_size, lambda w: w.qpos[:, :7]),

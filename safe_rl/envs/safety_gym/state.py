@@ -9,7 +9,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs.physics import Physics
-from safe_rl.envs.safety_gym.geometry import yaw_quaternion
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
 from safe_rl.envs.simulated import check_state
@@ -66,6 +65,12 @@ def refresh(world: World) -> None:
 def put(target: Tensor, mask: Tensor, values: Tensor) -> None:
     """Write values [N, ...] to a tensor [N, ...] in the rows of a mask [N]."""
     target.copy_(torch.where(mask.view(-1, *[1] * (target.ndim - 1)), values, target))
+
+
+def yaw_quaternion(yaw: Tensor) -> Tensor:
+    """Convert rotations about z by yaw [...] to quaternions (w, x, y, z) [..., 4]."""
+    zero = torch.zeros_like(yaw)
+    return torch.stack([torch.cos(yaw / 2), zero, zero, torch.sin(yaw / 2)], -1)
 
 
 def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:

@@ -34,6 +34,13 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
     return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + (r - radius).abs())
 
 
+def distance(a: Tensor, b: Tensor) -> Tensor:
+    """Euclidean distance over the last dimension."""
+    import torch
+
+    return torch.linalg.vector_norm(a - b, dim=-1)
+
+
 class NextGoal(Enum):
     """How a new goal is drawn."""
 
@@ -67,9 +74,8 @@ class Task(NamedTuple):
     at_origin: tuple[str, ...] = ()
 
 
-def _to_goal(world: World) -> Tensor:
-    from safe_rl.envs.safety_gym.geometry import distance
-
+def goal_distance(world: World) -> Tensor:
+    """Distance [N, 1] of the robot from the goal on the floor [m]."""
     return distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
 
 
@@ -88,8 +94,6 @@ def _presses_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
 
 def _to_box_and_goal(world: World) -> Tensor:
     import torch
-
-    from safe_rl.envs.safety_gym.geometry import distance
 
     box = world.at("box")
     return torch.cat(
@@ -113,9 +117,9 @@ def _com(world: World) -> Tensor:
 
 
 TASKS: dict[str, Task] = {
-    "goal": Task(_approach, _to_goal, _in_goal, NextGoal.POSITION, ("goal",)),
+    "goal": Task(_approach, goal_distance, _in_goal, NextGoal.POSITION, ("goal",)),
     "button": Task(
-        _approach, _to_goal, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
+        _approach, goal_distance, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
     ),
     "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION, ("goal", "box")),
     "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], _com),
