@@ -107,7 +107,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._physics = physics = self._make_physics(scene.model, num_threads)
         self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
         self._world = make_world(scene, self._physics)
-        self._plan = plan_placements(self.config, scene.slots, len(scene.names), physics.device)
+        self._plan = plan_placements(scene, physics.device)
         draw = partial(draw_layouts, self._plan, physics)
         self._layouts = LayoutsAhead(draw, num_envs, self._plan.num_columns, physics.device)
         self._observer = make_observer(scene, physics.device)

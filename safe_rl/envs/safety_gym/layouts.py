@@ -7,7 +7,7 @@ metres.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,7 +20,9 @@ from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BY_KIND, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.tasks import goal_is_button
+from safe_rl.envs.safety_gym.world import Scene
 
+_Rectangle = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax
 PIN_TOLERANCE = 1e-9  # half side of the square from which a pinned location is drawn
 
 
@@ -66,37 +68,30 @@ class PlacementPlan:
         return (self.keepouts[others] + self.keepouts[item] + self.margin).clamp(min=0.0)
 
 
-def plan_placements(
-    config: SafetyGymConfig,
-    slots: Mapping[str, slice],
-    num_slots: int,
-    device: torch.device | None = None,
-) -> PlacementPlan:
-    """Build the plan of a configuration, whose kinds have slots among the M objects.
+def plan_placements(scene: Scene, device: torch.device) -> PlacementPlan:
+    """Build the plan of a scene.
 
     Raises:
         ConfigError: If a placement leaves no room for its object's keepout.
     """
-    names, kinds, columns, keepouts, rectangles = [], [], [], [], []
+    config, rows = scene.config, []
     for kind in PLACEMENT_ORDER:
         if kind == "robot":
             labels, first = ["robot"], 0
-        elif kind not in slots or (kind == "goal" and goal_is_button(config.task)):
+        elif kind not in scene.slots or (kind == "goal" and goal_is_button(config.task)):
             continue
         else:
-            labels, first = BY_KIND[kind].names(config), 1 + slots[kind].start
+            labels, first = BY_KIND[kind].names(config), 1 + scene.slots[kind].start
         for index, label in enumerate(labels):
-            names.append(label)
-            kinds.append(kind)
-            columns.append(first + index)
-            keepouts.append(getattr(config, f"{kind}_keepout"))
-            rectangles.append(_rectangles(config, kind, label, index))
+            rows.append((label, kind, first + index, _rectangles(config, kind, label, index)))
+    names, kinds, columns, rectangles = zip(*rows, strict=True)
     stacked, thresholds = _stack(rectangles)
+    keepouts = [getattr(config, f"{kind}_keepout") for kind in kinds]
     return PlacementPlan(
-        names=tuple(names),
-        kinds=tuple(kinds),
-        columns=tuple(columns),
-        num_columns=1 + num_slots,
+        names=names,
+        kinds=kinds,
+        columns=columns,
+        num_columns=1 + len(scene.names),
         rectangles=stacked.to(device),
         thresholds=thresholds.to(device),
         keepouts=torch.tensor(keepouts, dtype=torch.float64, device=device),
@@ -104,20 +99,17 @@ def plan_placements(
     )
 
 
-def _rectangles(
-    config: SafetyGymConfig, kind: str, label: str, index: int
-) -> list[tuple[float, ...]]:
+def _rectangles(config: SafetyGymConfig, kind: str, label: str, index: int) -> list[_Rectangle]:
     """Return rectangles for the centre of one object: its placements, reduced by its keepout."""
     locations = getattr(config, f"{kind}_locations")
     keepout = getattr(config, f"{kind}_keepout")
     if index < len(locations):
-        x, y = locations[index]
-        tolerance = PIN_TOLERANCE
-        return [(x - tolerance, y - tolerance, x + tolerance, y + tolerance)]
+        (x, y), half = locations[index], PIN_TOLERANCE
+        return [(x - half, y - half, x + half, y + half)]
     placements = getattr(config, f"{kind}_placements") or (config.placements_extents,)
     # If a side is twice the keepout, a point remains, and rounding may make its size negative.
     least = 2 * keepout - PIN_TOLERANCE
-    shrunk: list[tuple[float, ...]] = [
+    shrunk = [
         (xmin + keepout, ymin + keepout, xmax - keepout, ymax - keepout)
         for xmin, ymin, xmax, ymax in placements
         if min(xmax - xmin, ymax - ymin) >= least
@@ -131,7 +123,7 @@ def _rectangles(
     return shrunk
 
 
-def _stack(rectangles: list[list[tuple[float, ...]]]) -> tuple[Tensor, Tensor]:
+def _stack(rectangles: Sequence[list[_Rectangle]]) -> tuple[Tensor, Tensor]:
     """Pad to one tensor [P, R, 4]; also return cumulative probabilities by area, [P, R]."""
     most = max(len(group) for group in rectangles)
     padded = torch.tensor(
