@@ -15,7 +15,7 @@ from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.bodies import add_bodies, add_floor, add_targets, decorate
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.costs import COSTS
+from safe_rl.envs.safety_gym.costs import active_costs
 from safe_rl.envs.safety_gym.elements import ELEMENTS, Element, Motion
 from safe_rl.envs.safety_gym.readings import READINGS
 from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot, robot_path
@@ -97,25 +97,23 @@ def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
         spec.option.sleep_tolerance = SLEEP_TOLERANCE
 
 
-def _touched_kinds(config: SafetyGymConfig) -> set[str]:
-    """Kinds whose contacts with the robot are read by a cost, a task or an observation."""
-    costs = [row.touches for row in COSTS if row.active(config)]
-    readings = [row.touches for row in READINGS if row.present(config)]
-    return {kind for kinds in (TASKS[config.task].touches, *costs, *readings) for kind in kinds}
-
-
 def _add_sensors(
     spec: mujoco.MjSpec, config: SafetyGymConfig, present: list[Element]
 ) -> dict[str, list[str]]:
-    """Add the robot's velocity, and a sensor per object that counts its contacts with the robot."""
+    """Add the robot's velocity, and a sensor per object that counts its contacts with the robot.
+
+    Contacts are counted for the kinds whose contacts a task, a cost or an observation reads.
+    """
     spec.add_sensor(
         name="robot_vel",
         type=mujoco.mjtSensor.mjSENS_FRAMELINVEL,
         objtype=mujoco.mjtObj.mjOBJ_XBODY,
         objname="robot",
     )
+    readings = [row for row in READINGS if row.present(config)]
+    rows = [TASKS[config.task], *active_costs(config), *readings]
+    touched = {kind for row in rows for kind in row.touches}
     sensors: dict[str, list[str]] = {}
-    touched = _touched_kinds(config)
     for element in present:
         if element.kind not in touched:
             continue
