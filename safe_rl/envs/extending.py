@@ -236,7 +236,7 @@ def _keys_of(element: Element) -> dict[str, Key]:
     }
     if not element.singular:
         keys["num"] = Key(0, Objects)
-    if element.motion in (Motion.FREE, Motion.GUIDED):
+    if element.is_free:
         keys |= {"density": Key(0.001, Positive), "rots": Key((), tuple[float, ...])}
     if element.motion is Motion.GUIDED:
         keys["travel"] = Key(0.3, NotNegative)

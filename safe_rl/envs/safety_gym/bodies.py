@@ -20,18 +20,17 @@ def add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def add_bodies(
-    spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool = False
+    spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool
 ) -> None:
     """Add a body per object: a free body if it can be pushed, else a mocap body.
 
     Areas have a shape only if rays see them, or in a `decorated` world, which is for pictures.
     """
-    free = element.motion in (Motion.FREE, Motion.GUIDED)
     for name in element.names(config):
         body = spec.worldbody.add_body(
-            name=name, pos=[0, 0, element.height(config)], mocap=not free
+            name=name, pos=[0, 0, element.height(config)], mocap=not element.is_free
         )
-        if free:
+        if element.is_free:
             body.add_freejoint(name=name)
         if element.motion is not Motion.VIRTUAL or _shows_area(config, element, decorated):
             _add_geoms(spec, body, config, element)
@@ -80,7 +79,7 @@ def _add_geoms(
         geom.size[: len(shape.size)] = shape.size
         geom.rgba = [*element.rgb, 0.25 if ghost else 1.0]
         geom.contype = geom.conaffinity = 0 if ghost else 1
-        if element.motion in (Motion.FREE, Motion.GUIDED):
+        if element.is_free:
             geom.density = getattr(config, f"{element.kind}_density")
 
 

@@ -43,15 +43,27 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
 def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool) -> Scene:
     """Build a scene for the present content of its robot's files."""
     robot = load_robot(config.robot_base)
-    _set_options(robot.spec, sleep)
+    spec = robot.spec
+    _set_options(spec, sleep)
     present = [element for element in ELEMENTS if element.count(config) > 0]
+    guided = [element for element in present if element.motion is Motion.GUIDED]
     # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
     needs_areas = decorated or config.lidar_type == "natural"
-    in_physics = {Motion.STATIC} | ({Motion.VIRTUAL} if needs_areas else set())
+    mocaps = (Motion.STATIC, Motion.VIRTUAL) if needs_areas else (Motion.STATIC,)
+    placed = [element for element in present if element.motion in mocaps]
     try:
-        _add_objects(robot.spec, config, present, in_physics, decorated)
-        contact_names = _add_sensors(robot.spec, config, present)
-        model = robot.spec.compile()
+        add_floor(spec)
+        for element in present:
+            if element.is_free:
+                add_bodies(spec, config, element, decorated)
+        for element in guided:
+            add_targets(spec, config, element, decorated)
+        if decorated:
+            decorate(spec, config)
+        for element in placed:
+            add_bodies(spec, config, element, decorated)
+        contact_names = _add_sensors(spec, config, present)
+        model = spec.compile()
     except ValueError as error:
         raise ConfigError(
             f"'robot_base': {config.robot_base} does not fit into the world: {error}. If a name is "
@@ -59,33 +71,11 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
     scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
-    return _index(config, model, present, robot, in_physics, contact_names)
+    return _index(config, model, robot, present, guided, placed, contact_names)
 
 
 # To be called after an element, task, cost, observation or robot is registered.
 forget_scenes = _compile.cache_clear
-
-
-def _add_objects(
-    spec: mujoco.MjSpec,
-    config: SafetyGymConfig,
-    present: list[Element],
-    in_physics: set[Motion],
-    decorated: bool,
-) -> None:
-    """Add floor and elements, free bodies first."""
-    add_floor(spec)
-    for element in present:
-        if element.motion in (Motion.FREE, Motion.GUIDED):
-            add_bodies(spec, config, element, decorated)
-    for element in present:
-        if element.motion is Motion.GUIDED:
-            add_targets(spec, config, element, decorated)
-    if decorated:
-        decorate(spec, config)
-    for element in present:
-        if element.motion in in_physics:
-            add_bodies(spec, config, element, decorated)
 
 
 def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
@@ -134,24 +124,23 @@ def _add_sensors(
 def _index(
     config: SafetyGymConfig,
     model: mujoco.MjModel,
-    present: list[Element],
     robot: Robot,
-    in_physics: set[Motion],
+    present: list[Element],
+    guided: list[Element],
+    placed: list[Element],
     contact_names: dict[str, list[str]],
 ) -> Scene:
-    """Find the indices of all names in the compiled model."""
+    """Find the indices of all names in the compiled model.
+
+    `guided` elements have targets, and `placed` elements are mocap bodies.
+    """
     names: list[str] = []
     slots, heights = {}, []
     for element in present:
         slots[element.kind] = slice(len(names), len(names) + element.count(config))
         names += element.names(config)
         heights += [element.height(config)] * element.count(config)
-
-    def count(*motions: Motion) -> int:
-        return sum(element.count(config) for element in present if element.motion in motions)
-
-    num_free = count(Motion.FREE, Motion.GUIDED)
-    guided = [e for e in present if e.motion is Motion.GUIDED]
+    num_free = sum(element.count(config) for element in present if element.is_free)
     spans = [slots[element.kind] for element in guided] or [slice(0, 0)]
     return Scene(
         config=config,
@@ -161,9 +150,9 @@ def _index(
         kinds=tuple(element.kind for element in ELEMENTS),
         heights=tuple(heights),
         num_free=num_free,
-        num_mocap_slots=count(*in_physics),
+        num_mocap_slots=sum(element.count(config) for element in placed),
         guided=slice(spans[0].start, spans[-1].stop),
-        num_targets=count(Motion.GUIDED),
+        num_targets=spans[-1].stop - spans[0].start,
         travel=tuple(
             getattr(config, f"{element.kind}_travel")
             for element in guided

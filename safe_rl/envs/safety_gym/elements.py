@@ -106,6 +106,11 @@ class Element:
         return [self.label] if self.singular else [f"{self.label}{i}" for i in range(count)]
 
     @property
+    def is_free(self) -> bool:
+        """Whether the objects are bodies that can be pushed."""
+        return self.motion in (Motion.FREE, Motion.GUIDED)
+
+    @property
     def singular(self) -> bool:
         """Whether there is at most one object, whose name has no index."""
         return self.label == self.kind
