@@ -10,7 +10,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
-from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
@@ -39,10 +39,8 @@ class EnvironmentsSource(ConfigSource):
         return True
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Return the node of `env/<name>`."""
-        group, _, name = config_path.removesuffix(".yaml").rpartition("/")
-        if group != GROUP or name not in env_names():
-            raise ConfigLoadError(f"There is no {config_path} among the environments.")
+        """Return the node of `env/<name>`, for which Hydra has called `is_config`."""
+        name = config_path.removesuffix(".yaml").removeprefix(f"{GROUP}/")
         return ConfigResult(
             provider=self.provider,
             path=self.full_path(),
