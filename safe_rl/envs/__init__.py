@@ -17,17 +17,11 @@ from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.envs.contract import (
-        ConstrainedEnv,
-        ContractError,
-        check_constrained_env,
-    )
+    from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
     from safe_rl.envs.gymnasium.conversion import from_gymnasium, from_six_values
     from safe_rl.envs.making import make_env
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
-
-_CONTRACT = ("ConstrainedEnv", "ContractError")
 
 __all__ = [
     "EXTRAS",
@@ -55,12 +49,14 @@ __all__ = [
 __getattr__, __dir__ = import_later(
     __name__,
     {
-        **dict.fromkeys((*_CONTRACT, "check_constrained_env"), "safe_rl.envs.contract"),
+        "ConstrainedEnv": "safe_rl.envs.contract",
+        "ContractError": "safe_rl.envs.contract",
         "LayoutError": "safe_rl.envs.safety_gym.layouts",
         "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
+        "check_constrained_env": "safe_rl.envs.contract",
         "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
-        "make_env": "safe_rl.envs.making",
         "from_six_values": "safe_rl.envs.gymnasium.conversion",
+        "make_env": "safe_rl.envs.making",
     },
 )
 

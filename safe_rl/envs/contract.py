@@ -17,9 +17,6 @@ from torchrl.envs import EnvBase
 from safe_rl.envs.costs import COST
 from safe_rl.naming import key_name
 
-#: Specs of actions: numbers within bounds, choices as integers, choices as one-hot vectors.
-ACTIONS = (Bounded, Categorical, OneHot)
-
 
 class ConstrainedEnv(EnvBase):
     """A batch of N environments that are stepped together: an `EnvBase` of batch size [N].
@@ -185,7 +182,7 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
         )
     if "observation" not in env.observation_spec.keys():  # noqa: SIM118, a spec is no mapping
         yield f"it must observe 'observation', got {sorted(map(str, env.observation_spec.keys()))}."
-    if not isinstance(env.action_spec, ACTIONS):
+    if not isinstance(env.action_spec, Bounded | Categorical | OneHot):
         kind = type(env.action_spec).__name__
         yield f"its actions must be continuous and bounded, or choices, got {kind}."
     for key, part in env.observation_spec.items(True, True):

@@ -34,10 +34,6 @@ class OpenGLError(RuntimeError):
     """Nothing can be drawn on this machine; the message names the package to install."""
 
 
-def _has_screen() -> bool:
-    return sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
-
-
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
     """Open an OpenGL context that draws pictures of one size [pixels].
 
@@ -57,7 +53,8 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
 
 def load_backend() -> None:
     """Choose and load MuJoCo's OpenGL backend, for code that opens its own contexts."""
-    if not os.environ.get("MUJOCO_GL") and not _has_screen():
+    has_screen = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    if not os.environ.get("MUJOCO_GL") and not has_screen:
         os.environ["MUJOCO_GL"] = "egl"
     elif hasattr(gl_context, "GLContext"):
         return

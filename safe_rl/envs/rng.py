@@ -32,13 +32,6 @@ def _spread(counter: Tensor | int) -> Tensor | int:
     return (counter * _MIX_2 + (1 << 63)) % (1 << 64) - (1 << 63)
 
 
-def _mix_(x: Tensor) -> Tensor:
-    """Mix in place."""
-    x.bitwise_xor_(_shift_right(x, 30)).mul_(_MIX_1)
-    x.bitwise_xor_(_shift_right(x, 27)).mul_(_MIX_2)
-    return x.bitwise_xor_(_shift_right(x, 31))
-
-
 def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
     """Hash keys with counters, one counter after the other, into new keys.
 
@@ -54,7 +47,10 @@ def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
         1
     """
     for counter in counters:
-        key = _mix_((key ^ _spread(counter)).add_(_GAMMA))
+        key = (key ^ _spread(counter)).add_(_GAMMA)
+        key.bitwise_xor_(_shift_right(key, 30)).mul_(_MIX_1)
+        key.bitwise_xor_(_shift_right(key, 27)).mul_(_MIX_2)
+        key.bitwise_xor_(_shift_right(key, 31))
     return key
 
 

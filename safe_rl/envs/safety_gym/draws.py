@@ -136,17 +136,16 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
     put(world.layout[:, column], found, position)
     stuck = mask & ~found
     if not config.terminate_resample_failure:
-        physics.check(stuck, _no_place)
+        physics.check(
+            stuck,
+            lambda: LayoutError(
+                "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
+                "'terminate_resample_failure' to end such episodes."
+            ),
+        )
     if world.scene.num_mocap_slots:
         place_mocaps(world)
     return stuck
-
-
-def _no_place() -> LayoutError:
-    return LayoutError(
-        "No place for a new goal was found. Use fewer objects or smaller keepouts, or set "
-        "'terminate_resample_failure' to end such episodes."
-    )
 
 
 def _current(world: World) -> Tensor:
