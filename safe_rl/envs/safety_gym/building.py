@@ -100,9 +100,10 @@ def _add_sensors(
         objtype=mujoco.mjtObj.mjOBJ_XBODY,
         objname="robot",
     )
-    readings = [row for row in READINGS if row.present(config)]
-    rows = [TASKS[config.task], *active_costs(config), *readings]
-    touched = {kind for row in rows for kind in row.touches}
+    touched = set(TASKS[config.task].touches).union(
+        *(row.touches for row in active_costs(config)),
+        *(row.touches for row in READINGS if row.present(config)),
+    )
     sensors: dict[str, list[str]] = {}
     for element in present:
         if element.kind not in touched:

@@ -54,18 +54,16 @@ def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Ten
 
     None is no boundary. The circle task of CPO (Achiam et al. 2017, section 8.1) has one in x.
     """
-    (x, y), (most_x, most_y) = xy.abs().unbind(-1), map(_or_infinite, (half_x, half_y))
+    (x, y), halves = xy.abs().unbind(-1), (half_x, half_y)
+    most_x, most_y = (math.inf if half is None else half for half in halves)
     return (x - most_x).clamp_(min=0.0).add_((y - most_y).clamp_(min=0.0))
 
 
 def excess_speed(velocity: Tensor, limit: float | None) -> Tensor:
     """Excess [m/s] of the robot's speed in the plane over the limit: [N, 3] -> [N]."""
+    assert limit is not None  # see `suite.check`
     speed = torch.hypot(velocity[:, 0], velocity[:, 1])
-    return (speed - _or_infinite(limit)).clamp_(min=0.0)
-
-
-def _or_infinite(bound: float | None) -> float:
-    return math.inf if bound is None else bound
+    return (speed - limit).clamp_(min=0.0)
 
 
 class Cost(NamedTuple):

@@ -101,23 +101,20 @@ def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) ->
     elements = [element for element in ELEMENTS if element.observed(config)]
     if not elements:
         return []
-    read = _LIDARS[config.lidar_type](config, scene, elements, device)
+    make = _pseudo if config.lidar_type == "pseudo" else _natural
+    read = make(config, scene, elements, device)
     bins, kinds = config.lidar_num_bins, [element.kind for element in elements]
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
-        read = _while_awake(read, slice(first, first + bins))
+        read = partial(_read_awake, read, slice(first, first + bins))
     return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read, (0.0, 1.0))]
 
 
-def _while_awake(read: Callable[[World], Tensor], columns: slice) -> Callable[[World], Tensor]:
-    """Set the columns of buttons to 0 while their timer runs after a goal."""
-
-    def read_awake(world: World) -> Tensor:
-        readings = read(world)
-        readings[:, columns] *= (world.buttons_timer == 0).unsqueeze(-1)
-        return readings
-
-    return read_awake
+def _read_awake(read: Callable[[World], Tensor], columns: slice, world: World) -> Tensor:
+    """Return readings whose columns of buttons are 0 while their timer runs after a goal."""
+    readings = read(world)
+    readings[:, columns] *= (world.buttons_timer == 0).unsqueeze(-1)
+    return readings
 
 
 def _pseudo(
@@ -188,6 +185,3 @@ def _natural(
         return seen.index_select(1, column).flatten(1)
 
     return read
-
-
-_LIDARS = {"pseudo": _pseudo, "natural": _natural}

@@ -55,12 +55,6 @@ def lidar_halos(
         offset += config.render_lidar_offset_delta
 
 
-def goal_button(config: SafetyGymConfig, button_pos: np.ndarray) -> Marker:
-    """Return a transparent grey cylinder around the goal button, centred at `button_pos` [3]."""
-    radius = 2 * config.buttons_size
-    return Marker(CYLINDER, (radius, radius, radius), button_pos, GOAL_BUTTON_RGBA)
-
-
 def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
     """Yield low translucent walls at the boundaries."""
     if not config.constrain_boundary:
@@ -75,11 +69,6 @@ def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
             pos = np.array([0.0, 0.0, WALL_HALF_HEIGHT])
             pos[axis] = side
             yield Marker(BOX, (size[0], size[1], size[2]), pos, WALL_RGBA)
-
-
-def cost_sphere(robot_pos: np.ndarray) -> Marker:
-    """Return a red sphere around a robot at `robot_pos` [3] that has a cost."""
-    return Marker(SPHERE, (COST_RADIUS,) * 3, robot_pos, COST_RGBA)
 
 
 # Largest share of a frame's width and height for the inset of the robot's camera.
@@ -123,6 +112,7 @@ class WorldRenderer:
         return readings
 
     def _markers(self, row: int, readings: dict[str, Tensor], has_cost: bool) -> Iterator[Marker]:
+        """Yield rings, goal button, boundaries, and a sphere if the robot `has_cost`."""
         world = self._world
         robot_pos = world.robot_pos[row].cpu().numpy()
         robot_mat = world.robot_mat[row].cpu().numpy()
@@ -130,10 +120,12 @@ class WorldRenderer:
         yield from lidar_halos(self._config, seen, robot_pos, robot_mat)
         button = int(world.goal_button[row])
         if button != NO_BUTTON:
-            yield goal_button(self._config, world.at("buttons")[row, button].cpu().numpy())
+            button_pos = world.at("buttons")[row, button].cpu().numpy()
+            size = (2 * self._config.buttons_size,) * 3
+            yield Marker(CYLINDER, size, button_pos, GOAL_BUTTON_RGBA)
         yield from boundaries(self._config)
         if has_cost:
-            yield cost_sphere(robot_pos)
+            yield Marker(SPHERE, (COST_RADIUS,) * 3, robot_pos, COST_RGBA)
 
     def _add_inset(self, frame: np.ndarray) -> None:
         """Draw the image of the robot's camera in a corner, if it is observed and rendered."""

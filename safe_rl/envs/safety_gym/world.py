@@ -145,13 +145,13 @@ class World:
         Raises:
             KeyError: If they are not counted.
         """
-        if kind not in self.contacts and kind in self.scene.slots:
+        if kind in self.contacts:
+            return self.contacts[kind]
+        if kind in self.scene.slots:
             raise KeyError(
                 f"Contacts with '{kind}' are not counted: list it in 'touches' of the task, cost "
                 "or observation that reads them."
             )
-        if kind in self.contacts:
-            return self.contacts[kind]
         return self.sensordata[:, self._slots(kind)]
 
     def require(self, what: str, values: Any, *size: int) -> Tensor:
@@ -165,7 +165,7 @@ class World:
         )
 
     def _slots(self, kind: str) -> slice:
-        if kind not in self.scene.slots and kind not in self.scene.kinds:
+        if kind not in self.scene.kinds:
             raise ConfigError(
                 f"There is no kind '{kind}' of objects.{nearest(kind, self.scene.kinds)} There are "
                 f"{', '.join(self.scene.kinds)}."
