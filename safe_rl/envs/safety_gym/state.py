@@ -140,15 +140,22 @@ LAYOUT_KEYS = ("layout", "start_pose")
 OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
 
 
+def _stored(world: World) -> dict[str, Tensor]:
+    """Return the tensors that a state contains unchanged, by key."""
+    return {
+        **{key: getattr(world.physics, key) for key in (*PHYSICS_KEYS, "ctrl")},
+        **{key: getattr(world, key) for key in (*TASK_KEYS, *LAYOUT_KEYS)},
+        **world.physics.memory,
+    }
+
+
 def read_state(world: World) -> TensorDict:
     """Return copies of the state of N worlds, a TensorDict [N]."""
-    state = {key: getattr(world.physics, key).clone() for key in (*PHYSICS_KEYS, "ctrl")}
-    state |= {key: getattr(world, key).clone() for key in (*TASK_KEYS, *LAYOUT_KEYS)}
-    goal = world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
-    state["goal_pos"] = goal.clone()
-    state |= {key: memory.clone() for key, memory in world.physics.memory.items()}
-    state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets].clone()
-    return TensorDict(state, batch_size=[len(world.step_count)])
+    state = _stored(world)
+    has_goal = "goal" in world.scene.slots
+    state["goal_pos"] = world.at("goal")[:, 0] if has_goal else torch.zeros_like(world.com)
+    state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets]
+    return TensorDict(state, batch_size=[len(world.step_count)]).clone()
 
 
 def write_state(world: World, state: TensorDictBase) -> None:
@@ -157,16 +164,9 @@ def write_state(world: World, state: TensorDictBase) -> None:
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
     physics.reset(everywhere)
-    for key in PHYSICS_KEYS:
-        getattr(physics, key).copy_(state[key])
-    for key in (*TASK_KEYS, *LAYOUT_KEYS):
+    for key, tensor in _stored(world).items():
         if key in state:
-            getattr(world, key).copy_(state[key])
-    for key, memory in physics.memory.items():
-        if key in state:
-            memory.copy_(state[key])
-    if "ctrl" in state:
-        physics.ctrl.copy_(state["ctrl"])
+            tensor.copy_(state[key])
     physics.mocap_quat[:, : scene.num_targets] = target_quat
     world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
     if goal_is_button(scene.config.task):
