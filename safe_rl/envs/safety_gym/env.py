@@ -28,7 +28,6 @@ from safe_rl.envs.safety_gym.draws import (
     start_episodes,
 )
 from safe_rl.envs.safety_gym.layouts import plan_placements
-from safe_rl.envs.safety_gym.lidar import lidar_blocks
 from safe_rl.envs.safety_gym.observations import make_observer, observation_spec
 from safe_rl.envs.safety_gym.renderer import WorldRenderer
 from safe_rl.envs.safety_gym.state import (
@@ -113,9 +112,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._observer = make_observer(scene, physics.device)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
-        self._renderer = WorldRenderer(
-            self._world, lidar_blocks(self.config, scene, physics.device)
-        )
+        self._renderer = WorldRenderer(self._world)
         self._costs = active_costs(self.config)
         self.cost_keys = cost_keys(self._costs)
         observed = observation_spec(self.config, self._observer, num_envs, self.device)

@@ -16,7 +16,8 @@ from safe_rl.envs.safety_gym.bodies import VISION
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.display import Display
 from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
-from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, World
+from safe_rl.envs.safety_gym.lidar import lidar_blocks
+from safe_rl.envs.safety_gym.world import NO_BUTTON, World
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25
 # Sizes of boundaries [m]; a wall along one boundary only is longer than any arena.
@@ -78,10 +79,11 @@ INSET_SHARE = 1 / 3
 class WorldRenderer:
     """Draws the worlds of one environment with lidar halos, goal button, costs and labels."""
 
-    def __init__(self, world: World, lidars: list[Block]) -> None:
+    def __init__(self, world: World) -> None:
         self._world = world
         self._config = config = world.scene.config
         self._display = Display(config)
+        lidars = lidar_blocks(config, world.scene, world.physics.device)
         self._lidars = lidars if config.render_lidar_markers else []
 
     def frames(
