@@ -91,11 +91,9 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
         >>> make_env("CrowdedPoint").config.hazards_num
         9
     """
-    target = config.get("_target_") if isinstance(config, Mapping) else None
-    if target is not None:
-        assert isinstance(config, Mapping)
+    if isinstance(config, Mapping) and config.get("_target_") is not None:
         node = {"name": name, **config}
-        module = str(target).rpartition(".")[0]
+        module = str(config["_target_"]).rpartition(".")[0]
         if module.partition(".")[0] not in ("safe_rl", "torch"):
             allow(module)
     else:

@@ -16,11 +16,9 @@ import mujoco
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.tasks import TASKS
 
-BOX, CYLINDER, SPHERE = (
-    mujoco.mjtGeom.mjGEOM_BOX,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-)
+BOX = mujoco.mjtGeom.mjGEOM_BOX
+CYLINDER = mujoco.mjtGeom.mjGEOM_CYLINDER
+SPHERE = mujoco.mjtGeom.mjGEOM_SPHERE
 
 # Order in which kinds are placed; "robot" is not an element but is placed too.
 PLACEMENT_ORDER = [

@@ -45,11 +45,8 @@ ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xm
 PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators without a range in the file
-_PLANAR_JOINTS = (
-    mujoco.mjtJoint.mjJNT_SLIDE,
-    mujoco.mjtJoint.mjJNT_SLIDE,
-    mujoco.mjtJoint.mjJNT_HINGE,
-)
+_SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+_PLANAR_JOINTS = (_SLIDE, _SLIDE, _HINGE)
 _PLANAR_AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 

@@ -118,11 +118,10 @@ _DEBUG_SUITE = {
     for robot, own in _ROBOTS.items()
     for task, values in (_DEBUG | _BOUNDED).items()
 }
-_WITH_VISION: Values = {"observe_vision": True, "observation_flatten": False}
 
 # Named environments that are not part of the benchmark.
 EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
-    f"{name}Vision": config.replace(**_WITH_VISION)
+    f"{name}Vision": config.replace(observe_vision=True, observation_flatten=False)
     for name, config in (SUITE | _DEBUG_SUITE).items()
 }
 

@@ -112,18 +112,14 @@ def _box_in_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
     return now[:, 1] <= config.goal_size
 
 
-def _com(world: World) -> Tensor:
-    return world.com.clone()
-
-
 TASKS: dict[str, Task] = {
     "goal": Task(_approach, goal_distance, _in_goal, NextGoal.POSITION, ("goal",)),
     "button": Task(
         _approach, goal_distance, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
     ),
     "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION, ("goal", "box")),
-    "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], _com),
-    "z": Task(lambda c, w, before, now: c.reward_z * (now - before)[:, 2], _com),
+    "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], lambda w: w.com),
+    "z": Task(lambda c, w, before, now: c.reward_z * (now - before)[:, 2], lambda w: w.com),
     "circle": Task(
         lambda c, w, before, now: (
             c.reward_circle * circle_speed(w.com[:, :2], w.robot_vel[:, :2], c.circle_radius)
