@@ -68,17 +68,11 @@ class ConstrainedEnv(EnvBase):
         raise NotImplementedError(f"{type(self).__name__} cannot store its state.")
 
     def get_positions(self) -> TensorDictBase:
-        """Return the positions of objects by kind, a TensorDict [N] of [N, K, 3] (m).
-
-        It is empty by default.
-        """
+        """Return object positions by kind, a TensorDict [N] of [N, K, 3] (m); by default empty."""
         return TensorDict(batch_size=self.batch_size)
 
     def highest_cost(self, key: str) -> float:
-        """Return the largest possible cost of an episode: calls of `step` times the spec's bound.
-
-        It is infinite if the spec has no bound.
-        """
+        """Return the largest cost of an episode: calls of `step` times the bound in the spec."""
         spec = self.full_reward_spec[key]
         highest = float(spec.high.max()) if hasattr(spec, "high") else math.inf
         # the largest number of the dtype stands for no bound

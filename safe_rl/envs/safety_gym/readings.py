@@ -159,8 +159,7 @@ def _sensor_block(
 ) -> Block:
     """Return the block of some sensors; shape None keeps the size that a sensor has in MuJoCo."""
     shapes: Shapes = {model.sensor(i).name: shape or (int(model.sensor_dim[i]),) for i in sensors}
-    spans = [(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in sensors]
-    numbers = [column for span in spans for column in range(*span)]
+    numbers = [model.sensor_adr[i] + part for i in sensors for part in range(model.sensor_dim[i])]
     columns = torch.tensor(numbers, dtype=torch.int64, device=device)
     return Block(shapes, lambda w: convert(w.sensordata.index_select(1, columns)).flatten(1))
 

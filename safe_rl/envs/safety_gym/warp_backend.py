@@ -25,7 +25,7 @@ def make_warp_physics(
     config: SafetyGymConfig,
     model: mujoco.MjModel,
     num_envs: int,
-    device: torch.device | None,
+    device: torch.device,
     env_class: Any,
 ) -> Physics:
     """Build the physics for the value "warp" of the key `physics`.
@@ -34,14 +34,13 @@ def make_warp_physics(
         config: The configuration of the environment.
         model: Its compiled world.
         num_envs: Number of worlds, N.
-        device: Device of the worlds; None is the CPU.
+        device: Device of the worlds.
         env_class: `SafetyGymEnv`, for a trial on the CPU.
 
     Raises:
         ConfigError: If MuJoCo Warp does not support the robot, or for an unsupported device.
         ModuleNotFoundError: If MuJoCo Warp is not installed.
     """
-    device = torch.device("cpu") if device is None else device
     if device.type not in ("cpu", "cuda"):
         raise ConfigError(f"'physics' warp runs on the devices cpu and cuda, got {device}.")
     require_extra("mujoco_warp", extra="gpu")
