@@ -60,10 +60,8 @@ def key(default: Any, meaning: str) -> Any:
     return Key(default, None, meaning)
 
 
-@cache
-def allowed(annotation: Any) -> Values:
-    """Return the allowed values of keys with this annotation."""
-    return values_of(annotation)
+allowed = cache(values_of)
+"""Returns the allowed values of keys with an annotation."""
 
 
 def coerce(name: str, key: Key, value: Any) -> Any:

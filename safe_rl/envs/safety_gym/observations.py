@@ -61,11 +61,6 @@ class Observer(NamedTuple):
     read: Callable[[World], Tensor]
     bounds: dict[str, Bounds]
 
-    @property
-    def size(self) -> int:
-        """Number of columns of the flat observation."""
-        return sum(math.prod(shape) for shape in self.shapes.values())
-
     def split(self, flat: Tensor) -> dict[str, Tensor]:
         """Return views of a flat observation [N, n] by component, each [N, *shape]."""
         return {
@@ -113,13 +108,14 @@ def observation_spec(
 ) -> TensorSpec:
     """Return the spec of one flat vector, or of every component in its shape, with bounds."""
     kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
-    columns = torch.tensor([observer.bounds[name] for name in observer.columns]).T
-    widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
+    bounds = {name: torch.tensor(observer.bounds[name]) for name in observer.shapes}
     if config.observation_flatten:
-        return _within(columns.repeat_interleave(widths, dim=1), (num_envs, observer.size), kind)
+        widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
+        flat = torch.stack(list(bounds.values()), 1).repeat_interleave(widths, dim=1)
+        return _within(flat, (num_envs, flat.shape[1]), kind)
     components = {
-        name: _within(columns[:, i : i + 1].flatten(), (num_envs, *shape), kind)
-        for i, (name, shape) in enumerate(observer.shapes.items())
+        name: _within(bounds[name], (num_envs, *shape), kind)
+        for name, shape in observer.shapes.items()
     }
     return Composite(components, shape=(num_envs,))
 
