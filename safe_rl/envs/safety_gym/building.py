@@ -11,6 +11,7 @@ import functools
 
 import mujoco
 
+from safe_rl.envs.contract import add_columns
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.bodies import add_bodies, add_floor, add_targets, decorate
@@ -135,21 +136,16 @@ def _index(
 
     `guided` elements have targets, and `placed` elements are mocap bodies.
     """
-    names: list[str] = []
-    slots, heights = {}, []
-    for element in present:
-        slots[element.kind] = slice(len(names), len(names) + element.count(config))
-        names += element.names(config)
-        heights += [element.height(config)] * element.count(config)
+    slots = add_columns({}, {element.kind: element.count(config) for element in present})
     num_free = sum(element.count(config) for element in present if element.is_free)
     spans = [slots[element.kind] for element in guided] or [slice(0, 0)]
     return Scene(
         config=config,
         model=model,
-        names=tuple(names),
+        names=tuple(name for element in present for name in element.names(config)),
         slots=slots,
         kinds=tuple(element.kind for element in ELEMENTS),
-        heights=tuple(heights),
+        heights=tuple(element.height(config) for element in present for _ in element.names(config)),
         num_free=num_free,
         num_mocap_slots=sum(element.count(config) for element in placed),
         guided=slice(spans[0].start, spans[-1].stop),

@@ -217,10 +217,7 @@ class SafetyGymEnv(SimulatedEnv):
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Draw new goals where they are met; return these worlds, and those without a place.
-
-        The second value is None if no goal was drawn.
-        """
+        """Draw new goals where met; return these worlds, and those without a place, if drawn."""
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None

@@ -70,12 +70,7 @@ class Observer(NamedTuple):
 
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
-    """Build the observer of a scene.
-
-    Raises:
-        ConfigError: If nothing is observed, two components have one name, or the robot lacks a
-            sensor, camera or joint that is observed.
-    """
+    """Build the observer of a scene; ConfigError if a component cannot be observed."""
     blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:

@@ -46,13 +46,11 @@ def make_warp_physics(
     require_extra("mujoco_warp", extra="gpu")
     from safe_rl.envs.physics.warp_physics import WarpPhysics
 
-    contacts, constraints = most_contacts(config, env_class)
-    room = [
-        _power_of_two(max(config.physics_buffers * most, fewest))
-        for most, fewest in ((contacts, _FEWEST_CONTACTS), (constraints, _FEWEST_CONSTRAINTS))
-    ]
+    most, scale = most_contacts(config, env_class), config.physics_buffers
+    contacts = _power_of_two(max(scale * most[0], _FEWEST_CONTACTS))
+    constraints = _power_of_two(max(scale * most[1], _FEWEST_CONSTRAINTS))
     try:
-        return WarpPhysics(model, num_envs, device, contacts=room[0], constraints=room[1])
+        return WarpPhysics(model, num_envs, device, contacts, constraints)
     except (NotImplementedError, ValueError) as error:
         raise ConfigError(
             f"'physics' warp does not support the robot {config.robot_base!r}: {error} Use "
