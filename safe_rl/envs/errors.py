@@ -33,7 +33,8 @@ def on_cpu_only(key: str) -> str:
     )
 
 
-def require_integer(name: str, value: Any, lowest: int, highest: int = 2**63 - 1) -> None:
-    """Raise ConfigError unless an argument is an integer from `lowest` to `highest`."""
-    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= highest:
-        raise ConfigError(f"'{name}' must be an integer of at least {lowest}, got {value!r}.")
+def require_integer(name: str, value: Any, lowest: int) -> None:
+    """Raise ConfigError unless an argument is an integer from `lowest` to 2⁶³ - 1."""
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value < 2**63:
+        words = f"an integer of at least {lowest} and below 2**63"
+        raise ConfigError(f"'{name}' must be {words}, got {value!r}.")
