@@ -1,14 +1,14 @@
 """Constrained reinforcement learning on TorchRL.
 
-`safe_rl.train`, `resume`, `load`, `evaluate`, `report` and `make_env` are the way in from Python.
-`safe_rl.envs` holds the environments, `safe_rl.objectives` the constrained losses and solvers,
-`safe_rl.algorithms` what learns with them, `safe_rl.collectors` data collection with cost
-accounting.
+`safe_rl.train`, `resume`, `load`, `evaluate`, `report` and `make_env` are the functions to begin
+with. `safe_rl.envs` has the environments, `safe_rl.objectives` the constrained losses and solvers,
+`safe_rl.algorithms` the algorithms that use them, and `safe_rl.collectors` data collection with
+cost accounting.
 """
 
 from typing import TYPE_CHECKING
 
-import safe_rl.processor  # noqa: F401, comes before torch
+import safe_rl.processor  # noqa: F401, must precede torch
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:

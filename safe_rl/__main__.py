@@ -14,7 +14,7 @@ COMMANDS = {
     "train": "train an algorithm on an environment, as python train.py does",
     "evaluate": "measure a trained policy on whole episodes",
     "export": "write a trained policy as ONNX, or as a small folder",
-    "report": "put a folder of runs on one page",
+    "report": "summarise a folder of runs on one page",
 }
 USAGE = "\n".join(
     [
@@ -22,13 +22,13 @@ USAGE = "\n".join(
         "",
         *(f"  {name:<10} {meaning}" for name, meaning in COMMANDS.items()),
         "",
-        "safe-rl COMMAND --help says more.",
+        "safe-rl COMMAND --help describes a command.",
     ]
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int | str:
-    """Hand the rest of the command line over to a command; returns its exit status.
+    """Run a command with the rest of the command line; return its exit status.
 
     Examples:
         >>> main(["trian"])

@@ -53,7 +53,7 @@ def require_extra(module: str, extra: str) -> None:
 
 
 def installing(extra: str) -> str:
-    """The command that installs an extra: of the checkout that is imported, or of the package."""
+    """The command that installs an extra, for a checkout or for the installed package."""
     checkout = Path(__file__).parents[1]
     if (checkout / "pyproject.toml").is_file():
         return f"in {checkout}, pip install -e '.[{extra}]'"
@@ -61,7 +61,7 @@ def installing(extra: str) -> str:
 
 
 def hint_of_plugin(choice: str) -> str:
-    """A sentence on the extra that installs a plugin of Hydra, with its space, or nothing.
+    """A sentence, after a space, about the extra that installs a plugin of Hydra, or "".
 
     Examples:
         >>> hint_of_plugin("hydra/launcher=basic")
@@ -90,7 +90,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def needs_extra(module: str, extra: str) -> Callable[[T], T]:
-    """Say of a class or function that it needs a package of an extra, for `check_extra`.
+    """Mark a class or function as one that needs a package of an extra, for `check_extra`.
 
     Args:
         module: Name of the package's module.
@@ -105,7 +105,7 @@ def needs_extra(module: str, extra: str) -> Callable[[T], T]:
 
 
 def check_extra(part: Any) -> None:
-    """Check that the package is there which a class, or one of its bases, or a function needs.
+    """Check that the package is installed which a class, one of its bases or a function needs.
 
     Raises:
         ModuleNotFoundError: If it is not installed; the message says how to install it.

@@ -1,6 +1,6 @@
 """Files of a run: read without trusting them, written atomically.
 
-In `safe_rl` itself, because several rooms write files of a run.
+This is directly in ``safe_rl/``, because several folders write files of a run.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ _PACKAGED = Path(__file__).parent / "conf"
 CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[1] / "conf"
 """Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
 
-# Bytes of a configuration or of notes; those of a run have about ten thousand.
+# Largest size of a configuration or notes [bytes]; those of a run have about ten thousand.
 _MOST_BYTES = 1_000_000
-# Levels of a configuration; a run's has six. The C parser overflows the stack at some ten thousand.
+# Largest depth of a configuration; a run's is six. The C parser overflows the stack at about ten
+# thousand.
 _MOST_LEVELS = 100
 
 
@@ -49,7 +50,7 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Reads YAML in a tenth of OmegaConf's time, and 1e-4 as a number, as OmegaConf does.
 
-    To PyYAML alone, floats have a point, and exponents a sign.
+    By default PyYAML takes a number with an exponent for a text unless it has a point and a sign.
     """
 
 
@@ -58,14 +59,14 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITH_EXPONENT, [*"-+01
 
 
 def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """Read a regular file of bounded size, whoever wrote it.
+    """Read a regular file of bounded size.
 
     Args:
         path: The file.
         most: Largest size to read, bytes.
 
     Raises:
-        ValueError: If it is larger, or no regular file: a pipe would be waited for without end.
+        ValueError: If it is larger, or no regular file: reading a pipe could wait for ever.
         OSError: If it cannot be read.
 
     Examples:
@@ -91,7 +92,7 @@ def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
     """Read a JSON file of bounded size.
 
     Raises:
-        ValueError: If it is none, larger, or nested too deeply.
+        ValueError: If it is no JSON, is too large, or nested too deeply.
         OSError: If it cannot be read.
     """
     try:
@@ -101,28 +102,28 @@ def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file as plain dictionaries, lists and values; nothing in it is followed.
+    """Read a YAML file as plain dictionaries, lists and values, without aliases.
 
     Raises:
-        ValueError: If it is none, is too large or nested too deeply, or has aliases, which could
-            grow without end.
+        ValueError: If it is no YAML, is too large or nested too deeply, or has aliases: with them a
+            small file could fill the memory.
         OSError: If it cannot be read.
     """
     try:
         text = read_bounded(path).decode("utf-8")
         _check_levels(text)
-        # without a star there is none, and reading hundreds of runs takes a fifth less
+        # an alias has a star; to look for it first saves a fifth of the time
         if "*" in text and any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise ValueError("it has YAML aliases, which no run writes")
         return yaml.load(text, Loader=_Loader)
-    # PyYAML looks a value such as `!!bool perhaps` up, and reports what that raises
+    # PyYAML looks up a value such as `!!bool perhaps`, which raises a KeyError
     except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path.name} cannot be read ({reason})") from error
 
 
 def _check_levels(text: str) -> None:
-    """Refuse what is nested too deeply, by the parser's events, which need no stack."""
+    """Refuse what is nested too deeply, by the parser's events, which need no recursion."""
     level = 0
     for event in yaml.parse(text, Loader=_Loader):
         level += isinstance(event, yaml.CollectionStartEvent)
@@ -132,13 +133,14 @@ def _check_levels(text: str) -> None:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    r"""Read a run's configuration, which has been resolved before it was saved.
+    r"""Read a run's configuration, which was resolved before it was saved.
 
     Interpolations are refused: ``${oc.env:…}`` in a file of another person could copy a secret of
     this machine into a report.
 
     Raises:
-        ValueError: If it is no mapping with texts for keys, or has interpolations or aliases.
+        ValueError: If it is no mapping whose keys are texts, or has interpolations, control
+            characters or aliases.
         OSError: If it cannot be read.
 
     Examples:
@@ -151,8 +153,8 @@ def read_config(path: Path) -> dict[str, Any]:
     config = read_yaml(path)
     if not isinstance(config, dict) or not _all_plain(config):
         raise ValueError(
-            f"{path.name} is not that of a run: it takes a mapping without interpolations, ${{…}}, "
-            "and without control characters"
+            f"{path.name} is not that of a run: it has to be a mapping without interpolations, "
+            "${…}, and without control characters"
         )
     return config
 
@@ -163,15 +165,15 @@ def _all_plain(value: Any) -> bool:
         return keys_are_texts and all(map(_all_plain, value.values()))
     if isinstance(value, list):
         return all(map(_all_plain, value))
-    # control characters could change what a terminal shows, or does
+    # control characters could change what a terminal shows, or control it
     return not (isinstance(value, str) and ("${" in value or _CONTROLS.search(value)))
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give the name of a file to write, which takes the place of ``path`` when it is complete.
+    """Yield the path of a new file to write, which replaces ``path`` at the end of the block.
 
-    Readers see the old content or the new one, also after an interruption.
+    Readers see the old or the new content, also after an interruption.
 
     Examples:
         >>> import tempfile
@@ -182,13 +184,13 @@ def replacing(path: Path) -> Iterator[Path]:
         '1,2'
     """
     unfinished = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
-    # a new file, not a link that somebody prepared to have another file overwritten
+    # must be a new file: a prepared link could lead to another file
     os.close(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o666))
     try:
         yield unfinished
         unfinished.replace(path)
     finally:
-        with suppress(OSError):  # where its folder is gone, that is the error to report
+        with suppress(OSError):  # if the folder is gone, the error of the block is reported
             unfinished.unlink(missing_ok=True)
 
 
@@ -199,7 +201,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def replace_json(path: Path, content: Any) -> None:
-    """Write a JSON file by :func:`replacing`; a number that is not finite becomes null."""
+    """Write a JSON file by :func:`replacing`; numbers that are not finite become null."""
     text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
     replace_text(path, text + "\n")
 
@@ -213,7 +215,7 @@ def _finite(content: Any) -> Any:
 
 
 def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file, its header being the first of the rows, by :func:`replacing`."""
+    """Write a CSV file by :func:`replacing`; the first row is the header."""
     with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
@@ -224,25 +226,25 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         OSError: If they cannot be written.
     """
-    import torch  # here, because help and configurations are shown without it
+    import torch  # imported here: help and configurations are shown without torch
 
     try:
         with replacing(path) as unfinished:
             torch.save(content, unfinished)
-    except RuntimeError as error:  # of torch, for any failure to write
+    except RuntimeError as error:  # torch raises it for any failure to write
         reason = str(error).splitlines()[0]
         raise OSError(f"{path} cannot be written; is the disk full? ({reason})") from error
 
 
 def load_tensors(path: Path, *, lazy: bool = False) -> Any:
-    """Read what :func:`save_tensors` has written, by whomever; no code in it is run.
+    """Read a file of :func:`save_tensors`, also of another person; no code in it is run.
 
     Args:
         path: The file.
-        lazy: Whether tensors are read from the file when they are used, and not checked before.
+        lazy: Whether tensors are read from the file only when they are used, without a check.
 
     Raises:
-        ValueError: If it cannot be read.
+        ValueError: If the file cannot be read.
 
     Examples:
         >>> path = getfixture("tmp_path") / "state.pt"
@@ -252,7 +254,7 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
     """
     import torch
 
-    # without a GPU, tensors of one are read into main memory
+    # without a GPU, tensors that were on one are read into main memory
     device = None if torch.cuda.is_available() and not lazy else "cpu"
     try:
         if not path.is_file():
@@ -267,19 +269,19 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
         return torch.load(path, map_location=device, weights_only=True, mmap=lazy)
     except Exception as error:  # a file of unknown origin can be wrong in any way
         words = " ".join(str(error).split()) or type(error).__name__
-        if "weights_only" in words:  # torch's own message advises to turn this off
+        if "weights_only" in words:  # torch's message advises to turn off this protection
             words = "it holds more than tensors, numbers and plain containers"
         raise ValueError(words) from error
 
 
 def check_no_links(folder: Path) -> None:
-    """Refuse a folder that holds links: what is written or removed there could lie anywhere.
+    """Refuse a folder that holds links: files written or removed there could lie anywhere.
 
-    The folder itself may be reached by a link. ``wandb/`` may hold links, which Weights & Biases
-    makes itself; nothing else writes there.
+    The path of the folder itself may have links. ``wandb/`` may hold links, because Weights &
+    Biases makes some, and nothing else writes there.
 
     Raises:
-        ValueError: Naming the first link.
+        ValueError: If there is a link; the message names the first one.
 
     Examples:
         >>> folder = getfixture("tmp_path")
@@ -308,7 +310,7 @@ def check_place(path: Path, otherwise: str) -> None:
         otherwise: Advice for the error, a sentence.
 
     Raises:
-        OSError: If it is a folder, or may not be made.
+        OSError: If it is a folder, or cannot be made.
 
     Examples:
         >>> check_place(getfixture("tmp_path"), "Take another name.")  # doctest: +ELLIPSIS

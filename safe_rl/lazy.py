@@ -1,7 +1,7 @@
 """Names of a package that are imported at their first use (PEP 562).
 
-`train.py --help` and error messages need only names of environments and tables of keys; torch,
-TorchRL and MuJoCo take seconds to import.
+`train.py --help` and error messages need only names of environments and tables of keys, and not
+torch, TorchRL and MuJoCo, which take seconds to import.
 """
 
 from __future__ import annotations

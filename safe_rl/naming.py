@@ -9,11 +9,11 @@ from typing import Any
 __all__ = ["STEPS_TAKEN", "did_you_mean", "key_name", "nearest"]
 
 STEPS_TAKEN = "steps_taken"
-"""Below "next": how many steps of the environment an action was held for, [..., 1] of integers."""
+"""Key below "next": the number of environment steps that an action was held for, [..., 1]."""
 
 _LIKENESS = 0.5
 _BEGINNING = 4
-"""Letters from which on a name may be the beginning of the one that was meant."""
+"""Shortest name that may count as the beginning of another one [letters]."""
 
 
 def key_name(key: str | tuple[Any, ...]) -> str:
@@ -27,14 +27,14 @@ def key_name(key: str | tuple[Any, ...]) -> str:
 
 
 def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:
-    """Return the known name most like `name`, or None if none is like it.
+    """Return the known name that is most similar to `name`, or None if none is similar.
 
-    Capitals and hyphens make no difference.
+    Capitals are ignored, and hyphens count as underscores.
 
     Args:
-        name: The wrong one.
-        known: The right ones.
-        likeness: Ratio of difflib's below which two names have nothing to do with each other.
+        name: The wrong name.
+        known: The right names.
+        likeness: Smallest ratio of difflib's SequenceMatcher at which two names are similar.
 
     Examples:
         >>> nearest("hazard_num", ["hazards_num", "vases_num"])
@@ -50,9 +50,10 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
 
 
 def _likeness(name: str, found: str) -> tuple[bool, float, bool, bool, int]:
-    """First what the name is the beginning of, as PPOLag is; then by letters, by length last.
+    """Sort key of similar names, compared element by element.
 
-    Of equally close ones, the one that stands whole in the name, then one of the same letters.
+    First names that begin with the given one, as ppo_lagrangian does with PPOLag; then by the
+    ratio; then names contained in it, names with the same letters, and names of similar length.
     """
     wanted, there = _plain(name), _plain(found)
     begun = len(name) >= _BEGINNING and _letters(there).startswith(_letters(wanted))
@@ -74,9 +75,9 @@ def _letters(plain: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str:
-    """Return a sentence to append to an error, with its space, or nothing if no name is like it.
+    """Return a sentence, after a space, to append to an error; "" if no name is similar.
 
-    For names that all begin alike, as costs do, `likeness` has to be higher (`nearest`).
+    For names with a common beginning, such as costs, `likeness` has to be higher (see `nearest`).
 
     Examples:
         >>> did_you_mean("cop", ["cpo", "cup", "ppo"])

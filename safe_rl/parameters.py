@@ -1,4 +1,4 @@
-"""What a function or class takes, read from its signature and its docstring."""
+"""The arguments of a function or class, read from its signature and its docstring."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Parameter(NamedTuple):
     """One argument of a function or class.
 
     Attributes:
-        values: What it may be.
-        meaning: What its docstring says of it, a sentence without its full stop.
-        is_described: Whether its annotation says more than a type: a hyper-parameter.
+        values: The values that it may have.
+        meaning: Its description in the docstring, a sentence without its full stop.
+        is_described: Whether its annotation describes a hyper-parameter, not only a type.
 
     Examples:
         >>> from safe_rl.ranges import Share
@@ -46,14 +46,14 @@ class Parameter(NamedTuple):
     is_described: bool = True
 
     def check(self, path: str, value: Any) -> None:
-        """Refuse a value that it cannot be.
+        """Refuse a value that the argument cannot have.
 
         Args:
-            path: Full path of the key, for the message.
+            path: Full key, for the message.
             value: The value, as a YAML file has it.
 
         Raises:
-            SettingError: If it is none of its values.
+            SettingError: If the argument cannot have the value.
         """
         if not self.values.hold(value):
             meaning = f" ({self.meaning})" if self.meaning else ""
@@ -64,8 +64,8 @@ class Part(NamedTuple):
     """A class or function that a configuration names as ``_target_``.
 
     Attributes:
-        rows: Its arguments by name; none if its signature cannot be read.
-        names: All that it takes; None if it takes any, or its signature cannot be read.
+        rows: Its arguments by name; empty if its signature cannot be read.
+        names: Names of all arguments; None if it takes any, or its signature cannot be read.
     """
 
     rows: Mapping[str, Parameter]
@@ -73,17 +73,17 @@ class Part(NamedTuple):
 
     @property
     def settings(self) -> dict[str, Parameter]:
-        """Its hyper-parameters: all arguments that the program does not hand over."""
+        """Its hyper-parameters: all arguments but those that the program passes itself."""
         return {name: row for name, row in self.rows.items() if row.is_described}
 
 
 class Optimiser:
-    """Arguments of torch's optimisers, whose annotations do not say what they may be.
+    """Arguments of torch's optimisers, whose own annotations have no ranges.
 
     Args:
         lr: Learning rate.
         betas: Decay rates of the moments.
-        eps: What is added to denominators.
+        eps: Number added to denominators.
         weight_decay: Decay of the weights.
         momentum: Weight of past gradients.
         fused: Whether to step in one kernel.
@@ -107,15 +107,15 @@ class Optimiser:
 
 
 def read_part(target: Any, path: str = "") -> Part:
-    """Find what a node names as ``_target_``, and read what it takes.
+    """Find the class or function that a node names as ``_target_``, and read its arguments.
 
     Args:
         target: The dotted name.
-        path: Key of the node, which is to be built; empty if it is only to be read.
+        path: Key of a node that is to be built; empty if the target is only to be read.
 
     Raises:
-        TargetError: If it may not be named, or does not exist.
-        SettingError: If it is to be built and needs a package of an extra that is not installed.
+        TargetError: If the target may not be named, or does not exist.
+        SettingError: If it is to be built and needs a package that is not installed.
 
     Examples:
         >>> part = read_part("safe_rl.objectives.ProjectedMultiplier")
@@ -129,7 +129,7 @@ def read_part(target: Any, path: str = "") -> Part:
         raise SettingError(f"{path}: {error}") from None
     try:
         chain = constructors(found)
-        # the package's constructors hand on all that they do not name, others may use it
+        # the package's constructors pass all of **kwargs on to a base; others may use them
         ours = all(function.__module__.startswith("safe_rl.") for function in chain)
         is_open = _takes_any(chain[-1] if ours else chain[0])
         return Part(parameters_of(found), None if is_open else sorted(accepted_names(found)))
@@ -140,7 +140,7 @@ def read_part(target: Any, path: str = "") -> Part:
 def accepted_names(target: Callable[..., Any]) -> set[str]:
     """Names of the arguments that a function or a class takes.
 
-    A constructor with ``**kwargs`` hands them on to its base, whose names count too.
+    A constructor with ``**kwargs`` passes them on to its base, whose names count too.
 
     Examples:
         >>> class Base:
@@ -155,10 +155,10 @@ def accepted_names(target: Callable[..., Any]) -> set[str]:
 
 @cache
 def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
-    """Arguments of a function or class by name, those of its bases included.
+    """Arguments of a function or class by name.
 
-    As `accepted_names`, this follows ``**kwargs`` to the next constructor. An annotation
-    that cannot be read, such as a name imported for type checkers only, allows anything.
+    As `accepted_names`, this follows ``**kwargs`` to the constructors of bases. An annotation that
+    cannot be evaluated, such as a name imported for type checkers only, allows anything.
     """
     if target.__module__.startswith("torch.optim"):
         return parameters_of(Optimiser)
@@ -174,7 +174,7 @@ def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
 
 
 def _arguments(target: Callable[..., Any]) -> Iterator[tuple[str, inspect.Parameter, Any]]:
-    """Arguments that have names, the class's own first, each with what its module defines."""
+    """Named arguments, the class's own first, each with the global names of its module."""
     for function in constructors(target):
         names = getattr(inspect.unwrap(function), "__globals__", {})
         for name, parameter in inspect.signature(function).parameters.items():
@@ -186,7 +186,7 @@ def _arguments(target: Callable[..., Any]) -> Iterator[tuple[str, inspect.Parame
 
 
 def constructors(target: Callable[..., Any]) -> list[Callable[..., Any]]:
-    """A function, or a class's constructors as far as each hands ``**kwargs`` on to the next."""
+    """A function, or a class's constructors as long as each passes ``**kwargs`` to the next."""
     functions = [target]
     if inspect.isclass(target):
         functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
@@ -201,7 +201,7 @@ def _takes_any(function: Callable[..., Any]) -> bool:
 
 
 def _evaluated(annotation: Any, names: dict[str, Any]) -> Any:
-    """An annotation that is written as text, in the module that wrote it."""
+    """Evaluate an annotation that is a text, with the names of its module."""
     if annotation is inspect.Parameter.empty:
         return Any
     try:
@@ -211,7 +211,7 @@ def _evaluated(annotation: Any, names: dict[str, Any]) -> Any:
 
 
 def _meanings(target: Callable[..., Any]) -> dict[str, str]:
-    """First sentence on every argument: of a function, or of a class and then of its bases."""
+    """The first sentence about every argument, from a function, or a class and its bases."""
     meanings: dict[str, str] = {}
     for owner in getattr(target, "__mro__", (target,)):
         for names, text in _entries(owner.__doc__ or ""):
@@ -228,14 +228,14 @@ def _entries(doc: str) -> list[tuple[str, str]]:
 
 
 def _sentence(text: str) -> str:
-    """The first sentence, to stand in a message: without capital, full stop and code marks."""
+    """The first sentence of a text, for a message: without capital, full stop and code marks."""
     plain = " ".join(text.replace("`", "").split())
     first = re.split(r"\.(?:\s|$)", plain, maxsplit=1)[0]
     return first[:1].lower() + first[1:] if first[1:2].islower() else first
 
 
 def _shown(value: Any) -> str:
-    """A value as it is written on a command line, cut if it is long."""
+    """A value as a command line has it, cut if it is long."""
     written = {None: "null", True: "true", False: "false"}
     is_word = value is None or isinstance(value, bool)
     shown = written[value] if is_word else " ".join(str(value).split())

@@ -1,6 +1,6 @@
 """Child processes that end with their parent, and leave signals to it.
 
-In `safe_rl` itself, because sweeps, collectors and environments start processes.
+This is directly in ``safe_rl/``, because sweeps, collectors and environments start processes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def end_with_parent(grace: float = 0.0) -> None:
     """End this process when its parent has ended for any reason.
 
     Args:
-        grace: Seconds for the run at hand, which gets SIGTERM, to write its checkpoint.
+        grace: Seconds that a run in this process has to write its checkpoint after SIGTERM.
     """
     if os.getpid() in _watching:
         return
@@ -32,10 +32,10 @@ def end_with_parent(grace: float = 0.0) -> None:
     parent = os.getppid()
 
     def watch() -> None:
-        # an orphan gets another parent
+        # when the parent ends, this process gets another one
         while os.getppid() == parent:
             time.sleep(_LOOK)
-        # a second SIGTERM would end at once a run that is ending already
+        # not if a first SIGTERM has restored the default: a second one would end the run at once
         if grace and callable(signal.getsignal(signal.SIGTERM)):
             os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(grace)
@@ -46,13 +46,13 @@ def end_with_parent(grace: float = 0.0) -> None:
 
 @contextmanager
 def starting_processes() -> Iterator[None]:
-    """Keep SIGINT, SIGTERM and SIGHUP from processes that this thread starts meanwhile.
+    """Block SIGINT, SIGTERM and SIGHUP in processes that this thread starts within the block.
 
-    Ctrl-C, the end of a terminal, and what ends the jobs of a cluster, reach all processes of a
-    run; the first process reacts to them. The others, which take seconds to start, would be ended.
-    They keep these signals waiting until they call :func:`leave_signals_to_parent`.
+    These signals reach all processes of a run: by Ctrl-C, by the end of a terminal, or from the
+    scheduler of a cluster. Only the first process should react to them, but they would end the
+    others while these start. The others block them until :func:`leave_signals_to_parent`.
     """
-    # started later, with the first process, it would unblock signals
+    # started later, together with the first process, the tracker would unblock the signals
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(
         signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
@@ -64,10 +64,10 @@ def starting_processes() -> Iterator[None]:
 
 
 def leave_signals_to_parent() -> None:
-    """End with the parent, or by its SIGTERM; pass over SIGINT, SIGHUP and SIGTERM of others.
+    """End with the parent, or by its SIGTERM; ignore SIGINT, SIGHUP and other SIGTERMs.
 
-    To be called in the main thread of a process that was begun within :func:`starting_processes`.
-    Where the system does not tell the sender of a signal (macOS), any SIGTERM ends it.
+    Call this in the main thread of a process that was started within :func:`starting_processes`.
+    Where the system does not tell the sender of a signal (macOS), any SIGTERM ends the process.
     """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

@@ -2,10 +2,10 @@
 
 Imported before torch, because OpenMP reads the setting when torch is loaded. By default idle
 threads spin for milliseconds after every operation and take the cores from the physics and other
-programs: two training runs on two cores then go ten times slower than one, not twice. Sleeping at
-once costs a few microseconds per operation. A setting of the user's is kept.
+programs: two training runs on two cores are then ten times slower than one, not twice. Sleeping at
+once costs a few microseconds per operation. A setting of the user is kept.
 
-In `safe_rl` itself, because networks and updates both ask for the kind of processor.
+This is directly in ``safe_rl/``, because networks and updates both need the kind of processor.
 """
 
 import os
@@ -18,11 +18,11 @@ __all__ = ["cpuinfo"]
 
 _FILE = Path("/proc/cpuinfo")
 
-# GOMP_SPINCOUNT is a finer setting of the same
+# GOMP_SPINCOUNT sets the same more finely
 _SETTINGS = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
 
 if not any(setting in os.environ for setting in _SETTINGS):
-    # also for processes that this one starts
+    # processes that this one starts inherit it
     os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
     if "torch" in sys.modules:
         warnings.warn(

@@ -1,7 +1,7 @@
-"""What a parameter may be: annotations for signatures, and the sets of values that they stand for.
+"""Annotations of parameters, and the sets of values that they stand for.
 
-A constructor says what it takes, ``gamma: Share`` or ``size: Annotated[int, Range(1, 100)]``, and
-`values_of` turns this into a check with words for a message.
+A constructor annotates its arguments, ``gamma: Share`` or ``size: Annotated[int, Range(1, 100)]``,
+and `values_of` turns an annotation into a check and a description for messages.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = [
 
 
 class Values(NamedTuple):
-    """A set of values; as metadata of `Annotated` it says which ones a parameter may have.
+    """A set of values; as metadata of `Annotated`, those that a parameter may have.
 
     Attributes:
-        hold: Whether a value is one of them.
-        words: What they are, to follow "it must be".
-        whole: Whether they are whole numbers, for which YAML's 3e5 is one too.
+        hold: Function that tells whether a value is one of them.
+        words: Their description, to follow "it must be".
+        whole: Whether they are whole numbers. Then a float such as YAML's 3e5 is one, too.
 
     Examples:
         >>> even = Values(lambda value: value in (2, 4), "2 or 4")
@@ -43,13 +43,13 @@ class Values(NamedTuple):
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number, finite in any case.
+    """Bounds of a finite number.
 
     Args:
-        low: Lower bound; None for the least number that there may be, -1e9 or -10¹⁵ if whole.
-        high: Upper bound; None for the largest.
-        above: Whether the lower bound itself is left out.
-        below: Whether the upper bound itself is left out.
+        low: Lower bound; None: -1e9, or -10¹⁵ for whole numbers.
+        high: Upper bound; None: 1e9, or 10¹⁵ for whole numbers.
+        above: Whether the lower bound itself is excluded.
+        below: Whether the upper bound itself is excluded.
 
     Examples:
         >>> values_of(Annotated[float, Range(0, 1, above=True)]).words
@@ -65,7 +65,7 @@ class Range:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; True and False are none."""
+    """Whether a value is a finite number; True and False are not."""
     is_real = isinstance(value, int | float) and not isinstance(value, bool)
     # a whole number may be too large to be a float
     return is_real and (isinstance(value, int) or math.isfinite(value))
@@ -84,7 +84,7 @@ PART = Values(
     lambda value: isinstance(value, Mapping) and is_text(value.get("_target_")),
     "a part with a _target_, as the files in conf/ have it",
 )
-"""Of a parameter that gets what another node of the configuration builds."""
+"""For a parameter whose argument is built from another node of the configuration."""
 
 Number = Annotated[float, Range()]
 Positive = Annotated[float, Range(0, above=True)]
@@ -99,10 +99,10 @@ Text = Annotated[str, _TEXT]
 
 
 def values_of(annotation: Any) -> Values:
-    """Which values an annotation stands for; anything where it does not say.
+    """The values that an annotation allows; any value if it has no meaning here.
 
-    Floats have to be finite. `Literal` names choices, ``X | None`` allows null; lists, tuples and
-    mappings are checked item by item.
+    Floats have to be finite. `Literal` names choices, and ``X | None`` allows null. Lists, tuples
+    and mappings are checked item by item.
 
     Examples:
         >>> size = values_of(list[Annotated[int, Range(1, 64)]])
@@ -131,9 +131,9 @@ def values_of(annotation: Any) -> Values:
 
 
 def is_described(annotation: Any) -> bool:
-    """Whether an annotation describes a hyper-parameter: by a range, choices, or as a bool.
+    """Whether an annotation describes a hyper-parameter: it has a range or choices, or is bool.
 
-    What it does not describe is handed over by the program, such as ``device: str``.
+    Other arguments, such as ``device: str``, are passed by the program.
 
     Examples:
         >>> is_described(Share | None), is_described(bool), is_described(float)
@@ -145,7 +145,7 @@ def is_described(annotation: Any) -> bool:
 
 
 def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
-    """The values of a type that its metadata leaves; unknown metadata leaves all."""
+    """The values that the first known metadata allows; those of the type if there is none."""
     for item in metadata:
         if isinstance(item, Values):
             return item
@@ -156,7 +156,7 @@ def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
 
 def _number(range: Range) -> Values:
     lowest = -1e9 if range.low is None else range.low
-    # what float32 can square
+    # float32 can hold its square
     highest = 1e9 if range.high is None else range.high
     low = f"above {lowest:g}" if range.above else f"from {lowest:g}"
     high = f"{'at most' if range.above else 'to'} {highest:g}"
@@ -218,9 +218,9 @@ _PLAIN: dict[Any, Values] = {
 
 
 class Checked:
-    """A base whose subclasses refuse keyword arguments outside what their constructors annotate.
+    """Base of classes whose constructors refuse keyword arguments that do not fit annotations.
 
-    Numbers, texts and lists are checked, live objects are not.
+    Numbers, texts and lists are checked; other objects are not.
 
     Examples:
         >>> class Discount(Checked):
@@ -259,4 +259,4 @@ def _checked(init: Callable[..., None]) -> Callable[..., None]:
 
 
 Options = Annotated[dict[str, Any], _mapping(ANYTHING)]
-"""Of a parameter that is handed on to another library."""
+"""For a parameter that is passed on to another library."""

@@ -1,6 +1,6 @@
 """Saving and restoring the state of objects that are not torch modules.
 
-It is directly in ``safe_rl/``, because several folders have such objects.
+This is directly in ``safe_rl/``, because several folders have such objects.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Resumable:
         return {name: _saved(getattr(self, name)) for name in self.state_names}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Continue from :meth:`state_dict`.
+        """Restore what :meth:`state_dict` has returned.
 
         Raises:
-            ValueError: If there is something else in the place of a number.
+            ValueError: If the saved value of a number is no number of the same type.
         """
         for name in self.state_names:
             own = getattr(self, name)
@@ -63,7 +63,7 @@ def _saved(value: Any) -> Any:
 
 
 def _restored(own: Any, saved: Any) -> Any:
-    """The saved value on the device of the current one; an object with a state loads it itself."""
+    """The new value of an attribute: the saved value, or the object after it has loaded it."""
     if isinstance(own, Tensor):
         return saved.to(own, copy=True)
     if isinstance(own, Mapping):

@@ -1,8 +1,8 @@
 """From a configuration's ``_target_`` to an object: the only place that does it.
 
-A configuration may come with a run of another person. It therefore reaches only what a run is built
-of: parts of this package, torch's optimisers, and modules that the user has named by ``import=``.
-The module is in `safe_rl` itself because all rooms build something.
+A configuration may come with a run of another person. It can therefore name only what runs are
+built of: parts of this package, torch's optimisers, and what modules define that the user has
+named by ``import=``. This is directly in ``safe_rl/``, because all folders build something.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from safe_rl.naming import did_you_mean
 
 __all__ = ["TargetError", "allow", "build", "locate"]
 
-# Rooms with parts of a run; where only some of the classes and functions are, their names: others
-# start programs, import modules, or write and remove files.
+# Packages and modules with parts of a run. Names are listed where other classes and functions start
+# programs, import modules, or write and remove files; None: all may be named.
 _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.algorithms": None,
     "safe_rl.collectors": ("make_process_collector", "make_ray_collector"),
@@ -56,15 +56,15 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
     """Build what a node's ``_target_`` names, as :func:`hydra.utils.instantiate` does.
 
     Args:
-        node: The node. Nodes in it that have a ``_target_`` too are built before; one with
-            ``_partial_: true`` becomes a function that takes the other arguments later.
-        objects: Live objects for the outermost target, which gets them as they are, not copied.
+        node: The node. Nodes within it that have a ``_target_`` are built first. A node with
+            ``_partial_: true`` becomes a function that takes the remaining arguments later.
+        objects: Further arguments of the outermost target. They are passed on without a copy.
 
     Returns:
-        The object, or None for a node that is null, or whose ``_target_`` is.
+        The object; None if the node or its ``_target_`` is null.
 
     Raises:
-        TargetError: If a target may not be built or does not exist, or if it refuses its arguments.
+        TargetError: If a target may not be named, does not exist, or refuses its arguments.
 
     Examples:
         >>> node = {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
@@ -95,7 +95,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
 
     Args:
         target: The name.
-        key: Key that holds it, for the message.
+        key: Key of the target, for the message.
 
     Raises:
         TargetError: If it may not be named, or does not exist.
@@ -136,13 +136,13 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         raise TargetError(f"{shown} is no dotted name.") from None
     if not (inspect.isclass(found) or inspect.isroutine(found)):
         raise TargetError(f"{shown} is neither a class nor a function.")
-    # what a module has imported from elsewhere, or a class has from a base, is not its own
+    # a module may import, and a class inherit, what configurations must not name
     home = getattr(found, "__module__", None) or ""
     homes = (room for room in roots if room == root or not _known(room))
     if not any(f"{home}.".startswith(f"{room}.") for room in homes):
         raise TargetError(
-            f"{shown}: '{root}' only borrows it from '{home}', which is out of reach of "
-            f"configurations. If you trust '{home}', add import={home} to the command and write "
+            f"{shown}: it is defined in '{home}', which configurations do not reach, not in "
+            f"'{root}'. If you trust '{home}', add import={home} to the command and write "
             f"_target_={home}.{found.__qualname__}."
         )
     return found
@@ -161,7 +161,7 @@ def _checked(node: Any, key: str) -> Any:
 
 
 def _known(root: str) -> tuple[str, ...] | None:
-    """All that configurations reach there; None where that is every class and function."""
+    """Names that configurations may use there; None where they may use all."""
     return None if root in _users_modules else _ROOMS.get(root)
 
 
@@ -170,7 +170,7 @@ def _join(key: str, name: str) -> str:
 
 
 def _in_words(error: InstantiationException, key: str) -> str:
-    """A component's own words, and the full key of its node."""
+    """The full key of a node, and the message of the error that its target raised."""
     cause = error.__cause__
     inner = str(error).partition("full_key: ")[2]
     words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"

@@ -1,1 +1,1 @@
-"""What a person types: training, evaluations, reports, and the same from Python."""
+"""The commands: training, evaluation, export and reports, and the same functions for Python."""

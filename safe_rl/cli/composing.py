@@ -1,8 +1,8 @@
-"""The configuration of a run, checked before anything is written.
+"""Compose the configuration of a run, and check it before anything is written.
 
-That of a new run is composed from overrides. That of a run that is continued is read from its
-folder, as plain values: Hydra looks for nothing there, so what somebody else has put into a folder
-cannot make code run.
+The configuration of a new run is composed from overrides. The configuration of a continued run is
+read from its folder as plain values. Hydra reads nothing there, so files that another person has
+put into the folder cannot run code.
 """
 
 from __future__ import annotations
@@ -53,21 +53,21 @@ _MISSING = object()
 def compose_jobs(
     texts: Sequence[str], *, sweep: bool = False, shown: bool = False
 ) -> list[DictConfig]:
-    """Compose what overrides ask for, and check it.
+    """Compose the configurations that overrides describe, and check them.
 
     Args:
         texts: The overrides.
-        sweep: Whether they may have several values each. Every value is checked once, with the
-            first of the other values.
-        shown: Whether the configuration is only shown: it may hold any values.
+        sweep: Whether overrides may have several values. Every value is checked once, together
+            with the first values of the other overrides.
+        shown: Whether the configuration is only printed; then its values are not checked.
 
     Returns:
-        Configurations with Hydra's own node: one, or of a sweep those that were checked.
+        Configurations with the node ``hydra``: one, or all those that were checked for a sweep.
 
     Raises:
-        CommandLineError: For a name that does not exist or is not read; right ones are named.
-        SettingError: For a value that a run cannot have.
-        ConfigError: For a value that the environment cannot have.
+        CommandLineError: If a name does not exist or is not read; the message names similar ones.
+        SettingError: If a run cannot have a value.
+        ConfigError: If the environment cannot have a value.
 
     Examples:
         >>> compose_jobs(["env=CarGoal1", "seed=3"])[0].seed
@@ -85,7 +85,7 @@ def compose_jobs(
 
 @contextmanager
 def hydra_on_conf() -> Iterator[Any]:
-    """Hydra on ``conf/``; whoever has initialised it elsewhere finds it as it was."""
+    """Initialise Hydra on ``conf/``; at the end, restore the state that it had before."""
     store_configs()
     before = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
@@ -98,7 +98,7 @@ def hydra_on_conf() -> Iterator[Any]:
 
 @contextmanager
 def resolving(config: DictConfig) -> Iterator[None]:
-    """Let ``${hydra:…}`` find Hydra's node of a configuration."""
+    """Make ``${hydra:…}`` refer to the node ``hydra`` of a configuration."""
     before = HydraConfig.instance().cfg
     HydraConfig.instance().set_config(config)
     try:
@@ -108,10 +108,10 @@ def resolving(config: DictConfig) -> Iterator[None]:
 
 
 def search_folders(folders: Iterable[str | Path]) -> list[str]:
-    """The override by which Hydra looks for files in some folders, too; none without folders.
+    """Return the override that adds folders to Hydra's search path; an empty list without folders.
 
     Raises:
-        CommandLineError: If there is no such folder.
+        CommandLineError: If a folder does not exist.
     """
     paths = [Path(folder).expanduser().absolute() for folder in folders]
     if missing := next((path for path in paths if not path.is_dir()), None):
@@ -121,7 +121,7 @@ def search_folders(folders: Iterable[str | Path]) -> list[str]:
 
 
 def _check_form(overrides: Sequence[Override]) -> None:
-    """Refuse parts of what is given as a whole, and lists of choices, which Hydra would merge."""
+    """Refuse what Hydra would merge: single keys below `GIVEN_WHOLE`, and lists of choices."""
     for override in overrides:
         key, line = override.key_or_group, override.input_line
         section, _, name = key.rpartition(".")
@@ -138,7 +138,7 @@ def _check_form(overrides: Sequence[Override]) -> None:
 
 
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
-    """Overrides of jobs in which every value of a sweep occurs."""
+    """Overrides of a few jobs in which every value of a sweep occurs."""
     values = [_sweep_lines(override) for override in overrides]
     first = [of_one[0] for of_one in values]
     yield first
@@ -147,7 +147,7 @@ def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
 
 
 def _sweep_lines(override: Override) -> list[str]:
-    """An override with each of its values; of an interval, from which sweepers draw, its ends."""
+    """An override for each value of a sweep; for an interval, one for each of its ends."""
     value, key = override.value(), override.get_key_element()
     if isinstance(value, IntervalSweep):
         return [f"{key}={value.start}", f"{key}={value.end}"]
@@ -160,14 +160,14 @@ def _compose(texts: list[str]) -> DictConfig:
     try:
         return compose("config", texts, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-        # of a group in a place of its own Hydra says itself how it is chosen
+        # where Hydra's message already proposes an override, it stays as it is
         wrong = re.match(r"Could not override '([^']+)'\.(?!\s*Did you mean)", str(error))
         given = next((t for t in texts if wrong and t.lstrip("+").startswith(f"{wrong[1]}=")), None)
         if wrong is None or given is None:
             raise CommandLineError(_explain(error, texts)) from None
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         key = inner[1] if inner and inner[1].startswith(f"{wrong[1]}.") else wrong[1]
-        # with all that is right, for what refers to it: the name of env=gymnasium is its env.id
+        # interpolations need the other overrides: env.name of env=gymnasium refers to env.id
         rest = _compose([text for text in texts if text != given])
         meant = [place for place in rest.hydra.runtime.choices if place.endswith(f"@{key}")]
         words = f"write {meant[0]}=…" if meant else unknown_key(key, plain(rest))
@@ -175,7 +175,7 @@ def _compose(texts: list[str]) -> DictConfig:
 
 
 def _explain(error: Exception, texts: Sequence[str]) -> str:
-    """Say in one line what is wrong with overrides, or files, that Hydra could not compose."""
+    """A message of one line about overrides or files that Hydra could not compose."""
     words = " ".join(str(error.__cause__ or error if not str(error) else error).split())
     if not isinstance(error, MissingConfigException) or error.missing_cfg_file is None:
         return words
@@ -187,7 +187,7 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
     )  # fmt: skip
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     file = re.match(r"In '(?!config')([^']+)'", words)
-    if file and group != "preset" and f"preset={name}" in texts:  # which chose it
+    if file and group != "preset" and f"preset={name}" in texts:  # the preset chose the file
         return f"'preset={name}' is not for this algorithm: {file[1]} has no {group} '{name}'."
     place = f"{file[1]}.yaml: " if file else ""
     return f"{place}there is no {group} '{name}'.{hint or did_you_mean(name, known, 0.6) or listed}"
@@ -196,7 +196,7 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
 def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
     try:
         with resolving(config):
-            OmegaConf.select(config, "hydra.run.dir")  # which names what every run has
+            OmegaConf.select(config, "hydra.run.dir")  # it refers to keys that every run has
             _check_read(overrides, config)
             check_settings(config)
             complete_env(plain(config)["env"])
@@ -210,7 +210,7 @@ def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 
 def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
-    """Refuse keys that a configuration holds and its algorithm does not read."""
+    """Refuse overrides of keys that the algorithm does not read."""
     algo = config.get("algo") or {}
     for override in overrides:
         key = override.key_or_group.replace("/", ".")
@@ -225,7 +225,7 @@ def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
 
 
 def _check_top(config: DictConfig) -> None:
-    """Refuse what stands at the top level and nothing refers to, as ``+lr=1e-4`` would add it."""
+    """Refuse unknown top-level keys, such as ``+lr=1e-4``, unless an interpolation uses them."""
     text = OmegaConf.to_yaml(config)
     for head in map(str, config):
         # ${head}, ${head.key}, ${resolver:head.key}
@@ -236,10 +236,10 @@ def _check_top(config: DictConfig) -> None:
 
 
 def check_risk(config: DictConfig) -> None:
-    """Refuse a measure of costs where nothing limits them.
+    """Refuse a risk measure where costs have no limit.
 
     Raises:
-        CommandLineError: If the algorithm, or a transform, would not read it.
+        CommandLineError: If neither the algorithm nor a transform would use it.
     """
     measure = (config.get("risk") or {}).get("_target_")
     is_constrained = config.algo.get("constrained") is not False
@@ -251,7 +251,7 @@ def check_risk(config: DictConfig) -> None:
 
 
 def is_to_keep_limits(config: DictConfig, is_constrained: bool) -> bool:
-    """Whether limits are kept by the algorithm, or by a transform that gives episodes a budget.
+    """Whether the algorithm keeps limits, or a transform gives every episode a cost budget.
 
     Args:
         config: Configuration of a run.
@@ -264,16 +264,16 @@ def is_to_keep_limits(config: DictConfig, is_constrained: bool) -> bool:
 def compose_resumed(
     directory: Path, texts: Iterable[str], modules: Sequence[str] | None = None
 ) -> DictConfig:
-    """The configuration of the run in a folder, with what is to be different from now on.
+    """Return the configuration of the run in a folder, with the changes that overrides make.
 
     Args:
         directory: The folder.
-        texts: Overrides of what is to be different.
-        modules: The user's modules; None if none are named.
+        texts: Overrides of keys that change from now on.
+        modules: The user's modules; None if ``import=`` was not given.
 
     Raises:
-        CommandLineError: If it is not the folder of a run, or something cannot change.
-        SettingError: For a value that a run cannot have.
+        CommandLineError: If it is not the folder of a run, or a key cannot change.
+        SettingError: If a run cannot have a value.
     """
     run = RunFolder(directory)
     try:
@@ -294,11 +294,11 @@ def compose_resumed(
 
 
 def _change(config: DictConfig, override: Override, directory: Path, said: Sequence[str]) -> None:
-    """Change a key of a run that is continued; what it began with may be said again."""
+    """Change a key of a continued run; overrides that it began with may be repeated."""
     key, line, value = override.key_or_group, override.input_line, override.value()
     before = OmegaConf.select(config, key, default=_MISSING) if "/" not in key else None
     if override.is_sweep_override():
-        raise CommandLineError(f"'{line}': a run has one value of it.")
+        raise CommandLineError(f"'{line}': a run has one value of this key.")
     if before is _MISSING and not (override.is_add() or override.is_hydra_override()):
         raise CommandLineError(f"'{line}': {unknown_key(key, plain(config))}")
     is_plain = not (override.is_delete() or "/" in key or isinstance(before, DictConfig))
@@ -318,12 +318,12 @@ def _change(config: DictConfig, override: Override, directory: Path, said: Seque
 
 
 def _refuse_foreign_cluster(config: DictConfig, overrides: Sequence[Override], path: Path) -> None:
-    """What Ray is started with can make code run: only the command line says it, not a file."""
+    """Refuse settings of Ray that come from a file: they can run code, so the user gives them."""
     said = [override.key_or_group for override in overrides]
     for key, value in flatten({"collector": config.get("collector") or {}}).items():
         is_of_ray = re.match(r"collector\.(ray_init|resources)\.(?!num_[cg]pus$)", key)
         if is_of_ray and value is not None and key not in said:
             raise CommandLineError(
-                f"{path} has {key}, which is not taken from a file, as it could make code run: "
-                f"say again {key}=…"
+                f"{path} has {key}. It is not taken from a file, because it could run code: "
+                f"give it again, {key}=…"
             )

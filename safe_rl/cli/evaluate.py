@@ -13,6 +13,6 @@ __all__ = ["main"]
 def main(
     arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.evaluate"
 ) -> int:
-    """The command; returns its exit status."""
+    """Run the command; return its exit status."""
     work = "safe_rl.cli.evaluating:carry_out"
     return run_command(work, arguments, f"{program} RUN_DIR", EvaluationOptions)

@@ -1,4 +1,4 @@
-"""A trained policy evaluated, certified, or run under variations."""
+"""Evaluate or certify a trained policy, or run it under variations."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ __all__ = ["carry_out", "certificate_options", "certify_run", "evaluate_run", "e
 
 
 def carry_out(words: list[str], options: EvaluationOptions, modules: Sequence[str] | None) -> int:
-    """Evaluate, certify or vary a run, and print what was found.
+    """Evaluate or certify a run, or run it under variations, and print the results.
 
     Args:
         words: The folder of the run.
-        options: What to do.
+        options: Options of the command.
         modules: The user's modules to import; None if ``import=`` was not given.
 
     Returns:
@@ -62,7 +62,7 @@ def evaluate_run(
     """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark.
 
     Raises:
-        ValueError: If the options ask for something else than an evaluation.
+        ValueError: If the options ask for a certificate or for variations.
     """
     directory = writable_copy(directory)
     if options.certify or options.variations is not None:
@@ -72,13 +72,13 @@ def evaluate_run(
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
-    """Certify a run's own problem, to which other options would make no difference."""
+    """Certify a run; refuse options that would have no effect on its certificate."""
     read = {name: getattr(options, name) for name in ("certify", "certificate", "num_threads")}
     for name, value in vars(EvaluationOptions(**read)).items():
         if getattr(options, name) != value:
             raise CommandLineError(
-                f"{name}: it is ignored by certify=true. A certificate is of the run's own "
-                "environment, and takes certificate.episodes=… and the like, and num_threads=…"
+                f"{name}: it is ignored by certify=true. A certificate is about the run's own "
+                "environment. Its options are certificate.episodes=… and so on, and num_threads=…"
             )
     certificate = certify_run(
         directory, num_threads=options.num_threads, changes=options.certificate
@@ -115,10 +115,10 @@ def certify_run(
 def certificate_options(
     config: DictConfig, changes: Mapping[str, Any] | None = None
 ) -> CertificateOptions:
-    """What is certified of a run: what its section ``certificate`` says, and what it has limited.
+    """The options of a run's certificate, from its sections ``certificate`` and ``risk``.
 
-    With ``risk=chance`` the share of episodes above the limit is certified, too, with ``risk=cvar``
-    the mean of the costliest ones.
+    With ``risk=chance`` the share of episodes above the limit is certified as well; with
+    ``risk=cvar`` the mean cost of the costliest episodes.
     """
     options = dict(config.certificate)
     for name, value in (changes or {}).items():
@@ -126,7 +126,7 @@ def certificate_options(
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
         KEYS[f"certificate.{name}"].check(f"certificate.{name}", value)
         options[name] = value
-    if not options["episodes"]:  # the run was to end without a certificate
+    if not options["episodes"]:  # training was to end without a certificate
         options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     risk = config.get("risk") or {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
@@ -136,18 +136,18 @@ def certificate_options(
 def evaluate_varied(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> tuple[Varied, Path]:
-    """Run a policy under ``options.variations``, and write the table and the picture.
+    """Run a policy under ``options.variations``, and write a table and a picture.
 
     Args:
         directory: Folder of the run.
-        options: Of the evaluation.
-        progress: Whether to say what is next.
+        options: Options of the evaluation.
+        progress: Whether to print each variation when it begins.
 
     Returns:
-        What was found, and the picture.
+        The results, and the path of the picture.
 
     Raises:
-        ValueError: For variations that there are not, or that the environment cannot have.
+        ValueError: If there are no such variations, or the environment cannot have them.
     """
     directory = writable_copy(directory)
     make = maker_of(directory)

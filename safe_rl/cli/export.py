@@ -24,7 +24,7 @@ class ExportOptions:
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
-    """The command; returns its exit status."""
+    """Run the command; return its exit status."""
     places = f"{program} RUN_DIR FILE.onnx|FOLDER"
     return run_command("safe_rl.cli.export:export", arguments, places, ExportOptions)
 
@@ -33,11 +33,11 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     """Write a policy to a file, or to a folder.
 
     Args:
-        words: Folder of the run, and where to.
-        options: Which of its policies.
+        words: Folder of the run, and the file or folder to write.
+        options: Options of the command.
         modules: The user's modules to import.
     """
-    # here, because help and mistyped options need none of torch
+    # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
     from safe_rl.evaluation.loading import find_checkpoint
     from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy

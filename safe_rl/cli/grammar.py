@@ -1,7 +1,7 @@
-"""The grammar of all commands, which is Hydra's: ``key=value``, read, written and checked.
+"""Read, write and check ``key=value``, which all commands take; the grammar is Hydra's.
 
-Training is given overrides of a configuration. Evaluations and reports are given options: fields of
-a dataclass, whose metadata holds their help.
+Training takes overrides of a configuration. The other commands take options: fields of a dataclass
+with help texts in their metadata.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Schema = TypeVar("Schema", bound="DataclassInstance")
 IMPORT = "import"
-"""The word that names modules of the user's."""
+"""The key that names the user's modules."""
 
 
 class CommandLineError(ValueError):
@@ -45,7 +45,7 @@ def parse(text: str) -> Override:
     """Read one override.
 
     Raises:
-        CommandLineError: If it is none.
+        CommandLineError: If the text is no override.
 
     Examples:
         >>> parse("env.hazards_num=3").value()
@@ -67,7 +67,7 @@ def parse(text: str) -> Override:
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The values of a word ``name=value``, and the other words.
+    """Split words into the values of all ``name=value``, and the other words.
 
     Examples:
         >>> take_word("slate", ["slate=SG6", "seed=0"])
@@ -79,7 +79,7 @@ def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def quote(text: str) -> str:
-    r"""Write a text so that the grammar reads it as it is.
+    r"""Quote a text so that the grammar reads it unchanged.
 
     Examples:
         >>> print(quote(r"it's a\b"))
@@ -90,13 +90,13 @@ def quote(text: str) -> str:
 
 
 def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
-    """Take ``import=`` out of a command line.
+    """Separate ``import=`` from the other arguments of a command line.
 
     Args:
         arguments: Arguments of a command; ``import=`` may be repeated, or hold a list.
 
     Returns:
-        The modules, None if ``import=`` is not given; and the other arguments.
+        The modules, or None if ``import=`` is not given; and the other arguments.
 
     Raises:
         CommandLineError: If a list cannot be read.
@@ -116,15 +116,15 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
 def overrides_of(
     settings: Mapping[str, Any], whole: Sequence[str] = (), prefix: str = ""
 ) -> Iterator[str]:
-    """Write settings from Python as overrides, nested ones with dots.
+    """Write settings from Python as overrides; nested keys are joined by dots.
 
     Args:
         settings: Key -> value.
-        whole: Keys whose mappings are one value.
-        prefix: Key above, with its dot.
+        whole: Keys whose mappings are written as one value.
+        prefix: Key of ``settings`` itself, followed by a dot.
 
     Raises:
-        CommandLineError: For a value that cannot be written.
+        CommandLineError: If a value has a type that overrides cannot express.
 
     Examples:
         >>> list(overrides_of({"model": {"hidden_sizes": [8]}, "cost_limits": {"cost": 3}}, ["cost_limits"]))
@@ -140,7 +140,7 @@ def overrides_of(
         except TypeError:
             raise CommandLineError(
                 f"{key}={value!r}: a setting takes numbers, texts, lists, dictionaries and None. "
-                "What is of your own is named as a _target_, or by a file that config_dir finds."
+                "Name an object of your own as a _target_, or in a YAML file below config_dir."
             ) from None
 
 
@@ -151,7 +151,7 @@ def _written(value: Any) -> str:
         return "[" + ",".join(map(_written, value)) + "]"
     if isinstance(value, str | Path):
         return quote(str(value))
-    # numbers and arrays of NumPy and torch are not JSON's
+    # JSON does not know numbers and arrays of NumPy and torch
     return _written(value.tolist()) if hasattr(value, "tolist") else json.dumps(value)
 
 
@@ -163,8 +163,8 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         schema: Dataclass with a default for every field.
 
     Raises:
-        CommandLineError: For an option that is unknown (the nearest is named), without a value, or
-            of another type than the schema's.
+        CommandLineError: If an option is unknown (the message names the nearest one), has no value,
+            or has a value of another type than in the schema.
 
     Examples:
         >>> from dataclasses import dataclass
@@ -191,7 +191,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
                 f"Unknown option '{name}'.{did_you_mean(name, kinds)} "
                 f"Options are: {', '.join(kinds)}."
             )
-        # names and paths are what was written, where the grammar reads `off`, `007` or `it's`
+        # texts are taken literally: the grammar would change `off` and `007`, and refuse `it's`
         is_text = kinds[name] in (str, str | None) and written[:1] not in ("'", '"')
         is_plain = is_text and written != "null"
         OmegaConf.update(read, key, written if is_plain else parse(argument).value())
@@ -203,16 +203,16 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
-    """Read options that are given as keyword arguments, as :func:`parse_options` does.
+    """Read options from keyword arguments, as :func:`parse_options` reads them from texts.
 
     Raises:
-        CommandLineError: As by `parse_options`.
+        CommandLineError: As for `parse_options`.
     """
     return parse_options(list(overrides_of(given, ["variations"])), schema)
 
 
 def usage(command: str, schema: type[DataclassInstance]) -> str:
-    """How a command is called: its options, their defaults and what they mean."""
+    """The help of a command: how it is called, its options, their defaults and meanings."""
     lines = [f"usage: {command} [option=value ...]", ""]
     for field in fields(schema):
         default = "null" if field.default is None else str(field.default).lower()
@@ -225,16 +225,16 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
 def run_command(
     work: str, arguments: Sequence[str] | None, command: str, schema: type[DataclassInstance]
 ) -> int:
-    """Read the words of a command, show its help or carry it out; returns its exit status.
+    """Read the arguments of a command, and run it or print its help; return its exit status.
 
-    An error is said in a line; ``HYDRA_FULL_ERROR=1`` shows all of it.
+    An error is printed as one line; ``HYDRA_FULL_ERROR=1`` shows the traceback instead.
 
     Args:
-        work: ``module:function``, imported when it is carried out: help and refusals need no torch.
-            The function takes what stands first, the options, and the modules of ``import=``, None
-            if there are none, and returns the exit status.
-        arguments: The words; None: those of the process.
-        command: How it is called: the program, then in capitals what stands first.
+        work: ``module:function``, imported when the command runs: help and errors about options
+            need no torch. The function takes the positional arguments, the options, and the
+            modules of ``import=`` or None, and returns the exit status.
+        arguments: The arguments; None: those of the process.
+        command: The program, followed by its positional arguments in capitals.
         schema: Dataclass of its options.
     """
     say_interruptions()
@@ -258,9 +258,9 @@ def run_command(
 
 
 def say_interruptions() -> None:
-    """Let Ctrl-C print a word instead of a traceback.
+    """Print one line on Ctrl-C instead of a traceback.
 
-    The process still ends by the signal, as shells want it that run commands in a loop.
+    The process still ends by the signal, so that a shell's loop over commands ends as well.
     """
 
     def say(kind: type[BaseException], *error: Any) -> None:

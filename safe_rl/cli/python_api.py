@@ -1,6 +1,6 @@
-"""The way in from Python: ``safe_rl.train``, ``resume``, ``load``, ``evaluate`` and ``report``.
+"""The functions for Python: ``safe_rl.train``, ``resume``, ``load``, ``evaluate``, ``report``.
 
-They do what the commands do, from the same configurations; Hydra stays inside.
+They do what the commands do, from the same configurations, and leave Hydra's global state as it is.
 """
 
 from __future__ import annotations
@@ -62,16 +62,17 @@ def train(
 ) -> Run:
     """Train, as ``python train.py env=… algo=…`` does.
 
-    Seeds torch, and sets the number of its threads if ``num_threads`` is given.
+    This seeds torch, and sets the number of its threads if ``num_threads`` is given.
 
     Args:
         env: Name of an environment.
         algo: Name of an algorithm.
         directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
-        imports: Module of yours to import before, or several, as the command's ``import=``.
-        callbacks: Called after every epoch with its row of the table; where one returns False, the
-            run ends there, like a finished one.
-        config_dir: Folder with YAMLs of yours, or several, as the command's ``--config-dir``.
+        imports: A module of yours to import first, or several, as the command's ``import=``.
+        callbacks: Called after every epoch with its row of the table. If one returns False, the
+            run ends like a finished one.
+        config_dir: A folder with YAML files of yours, or several, as the command's
+            ``--config-dir``.
         settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
             ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,
             ``policy_update={"max_kl": 0.02}``, or written with dots, ``**{"env.hazards_num": 12}``.
@@ -92,7 +93,7 @@ def train(
     if not (isinstance(env, str) and isinstance(algo, str)):
         raise CommandLineError(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
-            "environment of your own, a YAML that config_dir=… finds to an algorithm."
+            "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
@@ -113,15 +114,15 @@ def resume(
 
     Args:
         directory: Folder of the run.
-        imports: Modules that it needs; as in :func:`load`.
+        imports: Modules that the run needs, as in :func:`load`.
         callbacks: As in :func:`train`.
-        settings: What to change from now on: ``frames=500_000``,
+        settings: Keys to change from now on, such as ``frames=500_000`` or
             ``policy_update={"max_kl": 0.01}``.
 
     Raises:
-        ValueError: If the folder is not that of a run, the run has used modules that ``imports``
-            lacks, or a setting cannot change; the message names it.
-        KeyboardInterrupt: As by :func:`train`.
+        ValueError: If the folder holds no run, the run has used modules and ``imports`` is None,
+            or a setting cannot change; the message names it.
+        KeyboardInterrupt: As in :func:`train`.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -148,7 +149,7 @@ def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
 
     Args:
         run: The run, or its folder.
-        options: As of :meth:`Run.evaluate`.
+        options: Those of :meth:`Run.evaluate`.
 
     Examples:
         >>> print(evaluate(getfixture("tiny_run"), episodes=2))  # doctest: +ELLIPSIS
@@ -165,14 +166,14 @@ def load(
     Args:
         directory: Folder of the run, or ``certified/<environment>`` for one of the package's
             policies, such as ``certified/PointGoal1``.
-        checkpoint: "last", "best" (highest return that kept every limit), "certified" (to
-            keep them), or a path.
-        imports: Modules that its environment or policy needs; none is imported unless named here.
-            ``[]`` goes without those that the run has used.
+        checkpoint: "last", "best" (the highest return among those that kept every limit),
+            "certified" (to keep the limits), or a path.
+        imports: Modules that the environment or policy needs; no others are imported. ``[]`` opens
+            the run without the modules that it has used.
 
     Raises:
-        FileNotFoundError: If the folder is not that of a run, or has no such checkpoint.
-        ValueError: If the run has used modules that ``imports`` lacks.
+        FileNotFoundError: If the folder holds no run, or the run has no such checkpoint.
+        ValueError: If the run has used modules and ``imports`` is None.
 
     Examples:
         >>> run = load(getfixture("tiny_run").directory)
@@ -194,7 +195,7 @@ def report(directory: str | Path, **options: Any) -> Path:
         options: Those of the command, such as ``title="Mine"``.
 
     Returns:
-        The page.
+        Path of the page.
     """
     given = take_options(options, report_command.ReportOptions)
     return report_command.report(Path(directory).expanduser(), given)[1]
@@ -206,7 +207,7 @@ class Run:
 
     Attributes:
         directory: Its folder.
-        checkpoint: Which checkpoint ``policy`` has: "last", "best", "certified", or a path.
+        checkpoint: The checkpoint of ``policy``: "last", "best", "certified", or a path.
 
     Examples:
         >>> run = getfixture("tiny_run")  # what `safe_rl.train` returns
@@ -226,7 +227,7 @@ class Run:
 
     @cached_property
     def table(self) -> dict[str, list[float]]:
-        """Its table, by column of ``progress.csv``; NaN where no episode ended in an epoch."""
+        """The columns of ``progress.csv``; NaN in epochs in which no episode ended."""
         return read_table(RunFolder(self.directory).table)
 
     @property
@@ -236,23 +237,23 @@ class Run:
 
     @cached_property
     def env(self) -> EnvBase:
-        """One instance of its environment, with layouts that training has not met."""
+        """One instance of its environment, with layouts that training has not used."""
         return self.make_env()
 
     @cached_property
     def policy(self) -> TensorDictModuleBase:
-        """Its trained policy; :func:`torchrl.envs.set_exploration_type` chooses mean or sample."""
+        """Its trained policy; :func:`torchrl.envs.set_exploration_type` selects mean or sample."""
         path = loading.find_checkpoint(self.directory, self.checkpoint)
         return loading.load_policy(self.config, self.env, path, torch.device("cpu"))
 
     @property
     def certificate(self) -> dict[str, Any] | None:
-        """The content of ``certificate.json``: bounds, or by how much they are missed; or None."""
+        """The content of ``certificate.json``, or None if there is no such file."""
         path = RunFolder(self.directory).certificate
         return read_json(path) if path.is_file() else None
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Its table as a frame, a row per epoch; needs the extra ``report``."""
+        """Its table as a data frame with a row per epoch; needs the extra ``report``."""
         return import_extra("pandas", "report").DataFrame(self.table)
 
     def plot(self) -> Figure:
@@ -262,7 +263,7 @@ class Run:
         return learning_curves(self.table, dict(config.cost_limits), length, title)
 
     def __repr__(self) -> str:
-        """What it is, how it ended, and what is certified."""
+        """Algorithm, environment, outcome and certificate."""
         config = self.config
         lines = [f"Run({str(self.directory)!r}): {config.algo.name} on {config.env.name}"]
         if RunFolder(self.directory).num_rows:
@@ -275,7 +276,7 @@ class Run:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        """The same in a notebook, with the learning curves."""
+        """The same for a notebook, with the learning curves."""
         text = f"<pre>{html.escape(repr(self))}</pre>"
         curves = RunFolder(self.directory).curves
         picture = base64.b64encode(curves.read_bytes()).decode() if curves.is_file() else ""
@@ -286,8 +287,8 @@ class Run:
         """Make its environment.
 
         Args:
-            num_envs: Number of worlds, N.
-            seed: Of layouts and noise; None: as for evaluation, one that training never used.
+            num_envs: Number of environment instances, N.
+            seed: Seed of layouts and noise; None: that of evaluations, which training never uses.
             keys: Keys of the environment to change, such as ``hazards_num=12``.
 
         Raises:
@@ -299,7 +300,7 @@ class Run:
         return make(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:
-        """Run the policy for whole episodes; writes into the folder what the command writes.
+        """Run the policy for whole episodes; write the command's files into the folder.
 
         Args:
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
@@ -312,10 +313,10 @@ class Run:
         return evaluate_run(self.directory, take_options(given, EvaluationOptions))
 
     def certify(self, **changes: Any) -> Certificate | None:
-        """Find and certify its best checkpoint that keeps the limits, as at the end of training.
+        """Certify the best checkpoint that keeps the limits, as at the end of training.
 
         Args:
-            changes: Keys of the section ``certificate`` to replace, such as ``episodes=2000``.
+            changes: Keys of the section ``certificate`` to change, such as ``episodes=2000``.
 
         Returns:
             The certificate; None if the run has no limits or no checkpoints.
@@ -326,7 +327,7 @@ class Run:
         return certify_run(self.directory, changes=changes)
 
     def vary(self, variations: Any, **options: Any) -> Varied:
-        """Run the policy under variations of its environment; writes what the command writes.
+        """Run the policy under variations of its environment; write the command's files.
 
         Args:
             variations: As the command's ``variations=``: ``"dynamics"``, or custom rows,

@@ -25,7 +25,7 @@ FORMATS = ("png", "svg", "pdf")
 
 @dataclass
 class ReportOptions:
-    """Options of ``python -m safe_rl.report``; the help texts say what they mean.
+    """Options of ``python -m safe_rl.report``; their help texts describe them.
 
     Examples:
         >>> ReportOptions(seeds=5).unfinished
@@ -54,16 +54,16 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
     Args:
         root: The folder.
-        options: What to report, and where to.
+        options: Options of the command.
 
     Returns:
-        What there is to say, and the page that says it.
+        The content of the report, and the path of its page.
 
     Raises:
         FileNotFoundError: If there is no run.
-        OSError: If the page cannot be written, which is seen before any run is read.
-        ValueError: If RUNS_DIR/report is a link, by which others would choose what is overwritten;
-            if a slate is to take less than one run per environment.
+        OSError: If the page cannot be written; this is checked before any run is read.
+        ValueError: If an option cannot have its value; if RUNS_DIR/report is a link, because
+            another person could have chosen what it overwrites.
     """
     if options.seeds < 1:
         raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
@@ -73,7 +73,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
             raise ValueError(f"formats={form}: pictures are written as {', '.join(FORMATS)}.")
     out = root / "report" if options.out is None else Path(options.out)
     if options.out is None and out.is_symlink():
-        raise ValueError(f"{out} is a link: remove it, or say out=FOLDER.")
+        raise ValueError(f"{out} is a link: remove it, or give out=FOLDER.")
     if root.is_dir():
         check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
     algorithms = list(filter(None, map(str.strip, (options.algos or "").split(","))))
@@ -88,13 +88,13 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
-    """The command; returns its exit status."""
+    """Run the command; return its exit status."""
     work = "safe_rl.cli.report:carry_out"
     return run_command(work, arguments, f"{program} RUNS_DIR", ReportOptions)
 
 
 def carry_out(words: list[str], options: ReportOptions, modules: list[str] | None) -> int:
-    """Report the runs below the folder that stands first, and print what was left out."""
+    """Report the runs below a folder, the first word, and print what was left out."""
     import_modules(modules or ())
     root = Path(words[0])
     result, page = report(root, options)

@@ -1,7 +1,7 @@
 """Folders of new runs, and a run's own copy of a custom robot.
 
-A run is continued and evaluated with the robot that it began with, whatever has become of the
-user's file, which the configuration still names.
+A run is continued and evaluated with the robot that it began with, even if the user's file, which
+the configuration names, has changed.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ __all__ = ["keep_robot", "maker_of", "new_folder", "robot_of"]
 
 
 def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
-    """The folder of a new run, and whether it was made for it.
+    """Return the folder of a new run, and whether the folder is new as well.
 
-    Where the name is taken, by a run that began in the same second say, it gets a number. A folder
-    that the command line names is left as it is.
+    If a folder of that name exists, for example of a run that began in the same second, a number is
+    added to the name. A folder that the command line names is used as it is.
 
     Args:
         hydra: Hydra's own configuration.
 
     Raises:
-        OSError: If nothing can be written there.
+        OSError: If the folder cannot be made.
     """
     wanted = Path(os.path.abspath(Path(hydra.run.dir).expanduser()))
     if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
@@ -50,16 +50,16 @@ def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
 
 
 def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
-    """Note which robot a run begins with, and copy its files; bundled robots need none.
+    """Note which custom robot a run begins with, and copy its files.
 
-    Where they cannot be copied the hash is kept, and the reason is printed.
+    If the files cannot be copied, the note has their hash only, and the reason is printed.
 
     Args:
-        folder: The run's.
+        folder: Folder of the run.
         env: Node of its environment.
 
     Raises:
-        OSError: If nothing can be written.
+        OSError: If a file cannot be written.
     """
     robot = _own_robot(env)
     if robot is None:
@@ -75,14 +75,14 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
 
 
 def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
-    """An environment with the robot that a run began with.
+    """Return an environment's node with the robot that a run began with.
 
     Args:
-        folder: The run's, which may not have begun.
-        env: Node of an environment; one with another robot than the run's stays as it is.
+        folder: Folder of the run, which may not have begun.
+        env: Node of an environment. It is not changed if it names another robot than the run's.
 
     Raises:
-        ConfigError: If there is no file of it any more.
+        ConfigError: If the file of the robot is gone, or has changed.
     """
     note = read_json(folder.robot_note) if os.path.isfile(folder.robot_note) else {}
     if not note or note["robot_base"] != env.get("robot_base"):
@@ -104,5 +104,5 @@ def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
 
 
 def _own_robot(env: Mapping[str, Any]) -> Path | None:
-    """A robot file of the user's; environments of other families have none."""
+    """The user's robot file, if any; environments of other families have none."""
     return own_robot(env) if env.get("_target_") is None and "robot_base" in env else None

@@ -1,7 +1,7 @@
-"""The keys of a run: what each may hold and what it means, and the check of a configuration.
+"""The keys of a run: the values and the meaning of each, and the check of a configuration.
 
-Keys of parts are described by the signatures of these, keys of environments by the environments;
-defaults are in ``conf/``.
+Keys of parts are described by the parts' signatures, keys of environments by the environments.
+Defaults are in ``conf/``.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ GIVEN_WHOLE = {
     **{"cost_limits": "limits", "model.input_scale": "factors"},
     **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},
 }
-"""Mappings that are given all at once, and what is in them."""
+"""Mappings that are given all at once, and what their values are called."""
 
 _FOLDER = Values(lambda v: is_text(v) and "/" not in v, "a text that is not empty and has no /")
 _FOLDER_OF_ENV = f"{_FOLDER.words}: it names folders, and env.name=… gives another name"
@@ -151,28 +151,28 @@ KEYS = {path: Parameter(values_of(kind), meaning) for path, (kind, meaning) in _
     for name, row in parameters_of(CertificateOptions).items()
     if name != "tail"  # that of the risk
 }
-"""By full path: all keys but those of parts and environments."""
+"""Full key -> its description; all keys but those of parts and environments."""
 _ELSEWHERE = {
     **dict.fromkeys(("total_timesteps", "total_steps", "timesteps", "max_steps"), "frames"),
     **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
 }
-"""What other libraries call a key -> the key."""
+"""Name of a key in other libraries -> the key."""
 _LIKENESS = 0.6
-"""Likeness from which a key is taken for a misspelt one."""
+"""Similarity from which on a key counts as a misspelling of another one."""
 
 
 def check_settings(config: DictConfig) -> None:
-    """Check every key but the environment's: by `KEYS`, those of parts by their signatures.
+    """Check every key but the environment's: by `KEYS`, or by the signature of its part.
 
-    Custom parts are checked like the package's. Whole numbers that are written as 3e5 become
-    integers.
+    Custom parts are checked like the package's. Whole numbers written as 3e5 become integers in the
+    configuration.
 
     Args:
         config: Configuration as composed from ``conf/``.
 
     Raises:
-        SettingError: For the first key that does not exist or holds what it cannot.
-        TargetError: For a part that cannot be built.
+        SettingError: For the first key that does not exist or cannot have its value.
+        TargetError: For a part that may not be named or does not exist.
     """
     values = plain(config)
     for path, node, part in _nodes(values):
@@ -188,10 +188,10 @@ def check_settings(config: DictConfig) -> None:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A configuration as dictionaries and lists, without Hydra's own node.
+    """A configuration as dictionaries and lists, without the node ``hydra``.
 
     Raises:
-        SettingError: If a value refers to one that is not there.
+        SettingError: If an interpolation refers to a key that does not exist.
     """
     try:
         own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
@@ -201,14 +201,14 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def unknown_key(key: str, values: Mapping[str, Any]) -> str:
-    """Say that there is no such key, and what was meant: another key, or a choice that has it.
+    """A message that a key does not exist, with similar keys, or the choice that has the key.
 
     Args:
         key: The key.
         values: The configuration, as `plain` returns it.
     """
     algo, section = values.get("algo") or {}, key.partition(".")[0]
-    if section not in values and section in KEYS and section != "note":  # which is added
+    if section not in values and section in KEYS and section != "note":  # +note= adds a note
         return f"algo={algo.get('name')} has no '{section}'."
     if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
         return f"there is no key '{key}'.{reason}"
@@ -225,14 +225,14 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
 
 
 def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
-    """Keys that an algorithm does not read, choices that are not for it, and the reasons."""
+    """Keys and choices (``key=choice``) that an algorithm does not read -> the reasons."""
     from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
 
     return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
 
 
 def _nearest_keys(key: str, known: list[str]) -> list[str]:
-    """Those with the same last name, or the most alike one, or those with the most alike name."""
+    """Keys with the same last name; else the most similar key, or those with that last name."""
     ends = [path.rpartition(".")[2] for path in known]
     name = key.rpartition(".")[2]
     if name not in ends and (whole := nearest(key, known, _LIKENESS)):
@@ -242,7 +242,7 @@ def _nearest_keys(key: str, known: list[str]) -> list[str]:
 
 
 def _choice_with(key: str) -> str | None:
-    """The choice that would bring a key, as ``risk=cvar`` brings ``risk.tail``, or None."""
+    """The choice with a key, as ``risk=cvar`` is for ``risk.tail``; or None."""
     section, _, rest = key.partition(".")
     for file in sorted((CONF / section).glob("*.yaml")) if rest else ():
         held = flatten(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
@@ -254,10 +254,10 @@ def _choice_with(key: str) -> str | None:
 
 
 def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
-    """Full paths of what a configuration holds, and of what its parts would read besides.
+    """Full keys of a configuration, and of further settings that its parts would read.
 
     Yields:
-        A path, and whether the configuration holds it.
+        A key, and whether the configuration holds it.
     """
     for path, node, part in _nodes(values):
         if not path.startswith((*GIVEN_WHOLE, "default_cost_limits", "paper")):
@@ -269,10 +269,10 @@ def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
 def _nodes(
     values: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, Mapping[str, Any], Part]]:
-    """Mappings of a configuration, each before those within it.
+    """The mappings of a configuration, each before those within it.
 
     Yields:
-        Its key, what it holds, and what it may hold.
+        The full key of a mapping, the mapping, and which keys it may have.
     """
     target = values.get("_target_")
     if path == "env":
@@ -283,7 +283,7 @@ def _nodes(
     else:
         places = {key: key.rpartition(".") for key in KEYS}
         own = {name: KEYS[key] for key, (section, _, name) in places.items() if section == path}
-        # a section has no other keys than its rows; others may be tables of an algorithm's own
+        # a section has the keys of its rows only; other mappings may be an algorithm's own tables
         is_closed = path == "logger" or bool(path and own)
         yield path, values, Part(own, list(own) if is_closed else None)
     for name, value in values.items():

@@ -1,4 +1,4 @@
-"""One run from its configuration to its certificate, for the command, for sweeps and for Python."""
+"""One run from its configuration to its certificate: for the command, sweeps and Python."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ __all__ = ["SETTING_ERRORS", "Session", "run_job"]
 SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError, ModuleNotFoundError),
 )
-"""What is raised about settings and files, when a run is built or evaluated."""
+"""Errors about settings and files, raised when a run is built or evaluated."""
 _TRAINING_ERRORS = (
     *(OSError, TableError, ConfigError, ContractError, EpisodeError, FloatingPointError),
     WorkerError,
 )
-"""Errors of training whose message says more than where they were raised."""
+"""Errors of training whose message is enough, so that no traceback is shown."""
 
 
 class Session:
@@ -55,15 +55,15 @@ class Session:
     Args:
         config: Its configuration, checked.
         folder: Its folder.
-        hydra: Hydra's own configuration, which a new run notes.
+        hydra: The node ``hydra``, which a new run writes into its notes.
         continues: Whether to continue the run in the folder.
-        is_new: Whether the folder was not there before: it goes again if the run cannot begin.
+        is_new: Whether the folder did not exist before. It is removed if the run cannot begin.
         program: The command, as the user has called it; None: Python, where the outcome is not
             printed.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
 
     Attributes:
-        interrupted_by: The signal that has ended it, if one has.
+        interrupted_by: The signal that has ended the run, or None.
     """
 
     def __init__(
@@ -88,12 +88,12 @@ class Session:
 
     @classmethod
     def begin(cls, config: DictConfig, folder: Path | None = None, **options: Any) -> Session:
-        """A new run.
+        """Begin a new run.
 
         Args:
-            config: As `compose_jobs` returns it, with Hydra's own node, which is taken out.
+            config: As `compose_jobs` returns it; its node ``hydra`` is removed.
             folder: Its folder; None: the one that the configuration names.
-            options: As of the class.
+            options: Other arguments of the class.
         """
         if folder is None:
             with resolving(config):
@@ -105,12 +105,12 @@ class Session:
         return cls(config, folder, hydra, is_new=is_new, **options)
 
     def run(self) -> None:
-        """Train, or continue to train, and certify at the end what is to keep limits.
+        """Train, or continue to train; at the end, certify a run that is to keep limits.
 
-        Ctrl-C, SIGTERM or a closed terminal ends it after the epoch at hand.
+        Ctrl-C, SIGTERM or a closed terminal ends the run after the current epoch.
 
         Raises:
-            Exception: As `refuses` tells them apart.
+            Exception: Of any type; `refuses` tells whether the message is enough for the user.
         """
         try:
             self._complete()
@@ -140,7 +140,7 @@ class Session:
                 self._certify_if_long(trainer.episode_length)
 
     def refuses(self, error: Exception) -> bool:
-        """Whether an error is about settings, files or the environment: its message says enough."""
+        """Whether an error is about settings, files or the environment: the message is enough."""
         return isinstance(error, _TRAINING_ERRORS if self._has_begun else SETTING_ERRORS)
 
     def _say(self, line: str) -> None:
@@ -148,9 +148,9 @@ class Session:
             _print(line)
 
     def _complete(self) -> None:
-        """Fill the environment's keys up, so that the run's folder tells all of them."""
+        """Add the environment's defaults to its node, so that the saved configuration has them."""
         given = self._env_node()
-        # what is given as null has been found out
+        # keys that are null take the value that is found
         known = {key: value for key, value in given.items() if value is not None}
         with open_dict(self.config):
             self.config.env = complete_env(robot_of(self.folder, given)) | known
@@ -160,7 +160,7 @@ class Session:
 
     def _prepare(self) -> Trainer | None:
         """Build the run, or continue the one in the folder; None if that is finished."""
-        if "RL_LOGGING_LEVEL" not in os.environ:  # by which users let TorchRL say more
+        if "RL_LOGGING_LEVEL" not in os.environ:  # which users set to see more of TorchRL's notes
             logging.getLogger("torchrl").setLevel(logging.WARNING)
         config, folder = self.config, self.folder
         if not self._continues and folder.has_begun:
@@ -229,7 +229,7 @@ class Session:
             print(trainer.algorithm.lost_on_resume)
 
     def _write_notes(self, hydra: DictConfig) -> None:
-        """Write Hydra's notes, which it would write before it is known whether a run may begin."""
+        """Write Hydra's notes; Hydra itself would write them before the run is known to begin."""
         folder = self.folder
         folder.notes.mkdir(exist_ok=True)
         notes = ((folder.composed, self.config), (folder.overrides, hydra.overrides.task),
@@ -240,7 +240,7 @@ class Session:
 
     def _certify_if_long(self, episode_length: int) -> None:
         config = self.config
-        # of a test that ends early, after a fifth of its episodes
+        # steps of a test that stops early, after a fifth of its episodes
         steps = int(config.get("certificate", {}).get("episodes", 0) * episode_length / 5)
         if 0 < steps <= config.frames:
             self._certify()
@@ -253,7 +253,7 @@ class Session:
             )
 
     def _certify(self) -> None:
-        """Certify the run; if that is interrupted, a note stays, by which it is done later."""
+        """Certify the run; if this is interrupted, a file remains, and resuming certifies it."""
         folder = self.folder
         try:
             with lock_folder(folder):
@@ -270,11 +270,11 @@ class Session:
 
 
 def run_job(config: DictConfig) -> float:
-    """Carry out one job of a sweep, whose configuration Hydra has composed where it runs.
+    """Run one job of a sweep, whose configuration Hydra has composed in the job's process.
 
     Returns:
-        What a sweeper that optimises maximises: the run's final return, −∞ if it ends above a
-        limit or no episode has ended.
+        The value that an optimising sweeper maximises: the run's final return, or −∞ if it ends
+        above a limit or no episode has ended.
 
     Raises:
         SystemExit: If it is interrupted.
@@ -283,7 +283,7 @@ def run_job(config: DictConfig) -> float:
     hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
-    check_risk(config)  # of this combination
+    check_risk(config)  # for this combination of a sweep's values
     session = Session(config, folder.directory, hydra, continues=True)
     session.run()
     if session.interrupted_by is not None:
@@ -296,9 +296,9 @@ def run_job(config: DictConfig) -> float:
 
 
 def _print(line: str) -> None:
-    """Print a line, unless the terminal was closed, which may be what has ended the run."""
+    """Print a line, unless the terminal was closed; that may have ended the run."""
     try:
         print(line, flush=True)
     except OSError:
-        # what is left unsaid would be tried again at the very end, and change the exit status
+        # Python would flush the buffered line again at exit, and change the exit status
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115

@@ -1,4 +1,4 @@
-"""Sweeps of many runs: threads per job, and what became of every one."""
+"""Sweeps of many runs: the threads of each job, and a log of how each has ended."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def count_jobs(overrides: Sequence[str]) -> int:
 
 
 def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
-    """Threads with which jobs do not get in each other's way.
+    """Threads of each job, such that all jobs together use the cores once.
 
     Args:
         num_jobs: Jobs of the sweep.
-        num_workers: Jobs at a time; negative counts from the number of cores, -1 being all, as
-            joblib has it.
+        num_workers: Jobs at a time. Negative numbers count back from the number of cores, as in
+            joblib; -1 is all cores.
         num_cores: Cores of the machine.
 
     Examples:
@@ -59,16 +59,16 @@ def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
 class Sweep:
     """The function that Hydra's launcher calls for each job, in this process or in another one.
 
-    A failing job does not end the sweep: its traceback is written into its folder. Every job notes
-    in a log below the sweep's folder that it has begun and how it has ended.
+    A failing job does not end the sweep: its traceback is written into its folder. Every job writes
+    into a log below the sweep's folder when it begins and how it ends.
 
     Args:
-        hydra: Hydra's own node, of the first job.
-        overrides: Of the whole sweep.
+        hydra: The node ``hydra`` of the first job.
+        overrides: Overrides of the whole sweep.
     """
 
     def __init__(self, hydra: DictConfig, overrides: Sequence[str]) -> None:
-        # a sweeper that chooses the values has a number of trials
+        # a sweeper that chooses values itself has a number of trials
         self._num_jobs = hydra.sweeper.get("n_trials") or count_jobs(overrides)
         self._modules = imported()
         self._process = os.getpid()
@@ -84,26 +84,26 @@ class Sweep:
             os.environ.setdefault(LINE_SECONDS, "60")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Import the user's modules in a job's process, which gets this before it composes."""
+        """Import the user's modules in a job's process, before Hydra composes the job there."""
         vars(self).update(state)
         store_configs()
         import_modules(self._modules)
 
     def __call__(self, config: DictConfig) -> float:
-        """Carry out a job; returns what a sweeper maximises, −∞ if the job has failed."""
+        """Run a job; return the value that a sweeper maximises, −∞ if the job has failed."""
         from safe_rl.cli.session import run_job  # with torch: a sweep is checked without it
 
         hydra = cast(DictConfig, HydraConfig.get())
         folder = RunFolder(Path(hydra.runtime.output_dir))
         self._note(hydra, "interrupted")  # unless another line follows
         if os.getppid() == self._process:
-            # else it would train on, or wait for ever, when the sweep was killed
+            # otherwise the job would go on, or wait for ever, after the sweep was killed
             end_with_parent(_GRACE)
         try:
             value = run_job(config)
         except Exception as error:
             summary = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
-            if not isinstance(error, RunInUseError):  # the folder is somebody else's
+            if not isinstance(error, RunInUseError):  # then another process owns the folder
                 folder.directory.mkdir(parents=True, exist_ok=True)
                 replace_text(folder.failure, "".join(traceback.format_exception(error)))
                 summary += f" (see {folder.failure.name} there)"
@@ -115,12 +115,12 @@ class Sweep:
 
     def _note(self, hydra: DictConfig, state: str, error: str = "") -> None:
         note = [hydra.job.num, state, hydra.runtime.output_dir + error]
-        # appended in one piece, also by several processes
+        # one write per line: several processes append to the file
         with self._log.open("a") as file:
             file.write(json.dumps(note) + "\n")
 
     def print_summary(self) -> bool:
-        """Print how the jobs have ended; returns whether all are finished."""
+        """Print how the jobs have ended; return whether all are finished."""
         lines = self._log.read_text().splitlines() if self._log.exists() else []
         last = {job: (state, words) for job, state, words in map(json.loads, lines)}.values()
         num_done = sum(state == "done" for state, _ in last)

@@ -1,6 +1,6 @@
-"""The command ``train.py``: its words, and what they make: a run, a sweep, or what Hydra shows.
+"""The command ``train.py``: it reads its arguments and starts a run, a sweep or Hydra's output.
 
-What trains is imported when a run begins, so that help and refusals come at once.
+The modules of training are imported when a run begins, so that help and errors appear at once.
 """
 
 from __future__ import annotations
@@ -36,24 +36,25 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
     "--hydra-help": ("show these flags and Hydra's settings", {}),
     "--shell-completion -sc": ("tab completion: -sc install=bash", {}),
     "--multirun -m": ("a sweep: a run for every combination of values", {}),
-    "--config-dir -cd": ("folder with YAML files of yours; may be repeated", {"action": "append"}),
+    "--config-dir -cd": ("folder with your YAML files; may be repeated", {"action": "append"}),
     "--cfg -c": ("show the configuration", {"choices": ("job", "hydra", "all")}),
     "--package -p": ("with --cfg: show only this part", {"action": "store"}),
     "--resolve": ("with --cfg: show values, not references", {}),
 }
-"""Flag and its short form -> what it does, and how it is read unless it is a switch."""
+"""Flag and its short form -> its help, and arguments of argparse if it is not a switch."""
 
 
 class Command(NamedTuple):
-    """What a command line asks for.
+    """A command line that has been read.
 
     Attributes:
         flags: Flags by their long names, with underscores.
-        overrides: Overrides, with shorthands written out.
-        configs: What was composed and checked, with Hydra's own node for a new run: one, or of a
-            sweep the jobs in which every value occurs; none of a question to Hydra.
-        run: Folder of the run that is continued, if one is.
-        is_run: Whether it is one run, new or continued; else Hydra answers, or starts a sweep.
+        overrides: Overrides; shorthands such as ``slate=`` are written out.
+        configs: The checked configurations, those of new runs with the node ``hydra``: one, or for
+            a sweep jobs in which every value occurs; none for ``--help`` and the like.
+        run: Folder of the run that is continued, if any.
+        is_run: Whether it is one run, new or continued. Otherwise Hydra prints something, or starts
+            a sweep.
     """
 
     flags: Namespace
@@ -64,14 +65,14 @@ class Command(NamedTuple):
 
 
 def read_command(words: Sequence[str]) -> Command:
-    """Read a command line, and compose and check what it asks for, before anything is written.
+    """Read a command line; compose and check its configurations before anything is written.
 
     Args:
-        words: Of ``train.py``.
+        words: Arguments of ``train.py``.
 
     Raises:
-        CommandLineError: For a word that cannot be used; the message says what to write instead.
-        ValueError: For a value that a run, a part or an environment cannot have.
+        CommandLineError: If an argument cannot be used; the message says what to write instead.
+        ValueError: If a run, a part or an environment cannot have a value.
 
     Examples:
         >>> read_command(["slate=SGPoint", "-m", "seed=0"]).configs[0].env.name
@@ -109,11 +110,11 @@ def read_command(words: Sequence[str]) -> Command:
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python train.py") -> int | str:
-    """The command; returns its exit status, or the line with which it ends.
+    """Run the command; return its exit status, or the error message with which it ends.
 
     Args:
-        arguments: Its words; None: those of the process.
-        program: How the user has called it.
+        arguments: Its arguments; None: those of the process.
+        program: The command, as the user has called it.
     """
     say_interruptions()
     session = None
@@ -144,7 +145,7 @@ class _Parser(ArgumentParser):
 
 
 def _parser() -> ArgumentParser:
-    """Tells flags, which may stand anywhere, from overrides."""
+    """A parser of flags and overrides, in any order."""
     parser = _Parser(add_help=False, allow_abbrev=False)
     for names, (meaning, kind) in _FLAGS.items():
         parser.add_argument(*names.split(), help=meaning, **kind or {"action": "store_true"})
@@ -153,10 +154,11 @@ def _parser() -> ArgumentParser:
 
 
 def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
-    """Write ``slate=SG6`` out as the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
+    """Replace ``slate=SG6`` by the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
 
     Raises:
-        CommandLineError: If there is no such slate, or the command cannot have it.
+        CommandLineError: If there is no such slate, or it has several environments and the command
+            is no sweep.
 
     Examples:
         >>> expand_slate(["slate=SGDoggo", "seed=0"], is_sweep=True)[0]
@@ -178,7 +180,7 @@ def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
 
 
 def _with_launcher(words: list[str]) -> list[str]:
-    """Overrides of a sweep with joblib's launcher, where it is installed and none is chosen."""
+    """A sweep's overrides with joblib's launcher, if it is installed and none is chosen."""
     with suppress(ModuleNotFoundError):  # if Hydra has no plugin at all
         is_chosen = any(word.startswith("hydra/launcher=") for word in words)
         if not is_chosen and find_spec("hydra_plugins.hydra_joblib_launcher"):
@@ -187,7 +189,7 @@ def _with_launcher(words: list[str]) -> list[str]:
 
 
 def _ask_hydra(command: Command) -> int:
-    """Let Hydra show something, or start the jobs of a sweep; returns the exit status."""
+    """Let Hydra print what a flag asks for, or start a sweep; return the exit status."""
     flags, words = command.flags, command.overrides
     with hydra_on_conf() as hydra:
         if flags.help:

@@ -1,8 +1,8 @@
 """``import=my_module``: a user's own code, on the command line and in workers.
 
-A module may register environments, objects, costs and observations, and hold what a ``_target_``
-names. A run notes the modules in its configuration under ``import``, but only the command line
-makes them run: opening somebody's run executes nothing of theirs.
+A module may register environments, objects, costs and observations, and define what a ``_target_``
+names. A run's configuration lists the modules under ``import``, but they are imported only if the
+command names them: opening another person's run does not run their code.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _imported: list[str] = []
 
 
 def note_imports(modules: str | Sequence[str] | None) -> list[str]:
-    """The override by which a run notes its modules, or one module; none for None.
+    """The override that writes modules into a run's configuration; an empty list for None.
 
     Examples:
         >>> note_imports(["mine", "examples/other.py"])
@@ -35,13 +35,15 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
 
 
 def import_modules(modules: str | Sequence[str]) -> None:
-    """Import modules and let configurations name what they define.
+    """Import modules, and let configurations name what they define.
 
     Args:
-        modules: Dotted names, looked for in the current directory too, or paths of files; or one.
+        modules: One or several: dotted names, also of modules in the current directory, or paths
+            of files.
 
     Raises:
-        CommandLineError: If one does not exist, cannot be imported, or is hidden by another.
+        CommandLineError: If a module does not exist or cannot be imported, or if Python finds
+            another module of the same name.
     """
     modules = [modules] if isinstance(modules, str) else list(modules)
     for module in modules:
@@ -51,7 +53,7 @@ def import_modules(modules: str | Sequence[str]) -> None:
             name = path.stem
             if not path.is_file():
                 raise CommandLineError(f"{KEY}={module}: there is no such file.")
-        # the folder, not the file: other processes find by its name what they are sent
+        # the folder is added to the path: other processes import the module by its name
         folder = str(Path.cwd() if name == module else path.resolve().parent)
         if folder not in sys.path:
             sys.path.append(folder)
@@ -67,12 +69,12 @@ def import_modules(modules: str | Sequence[str]) -> None:
 
 
 def imported() -> list[str]:
-    """What has been imported in this process, for others to import."""
+    """The modules that this process has imported, for other processes to import."""
     return list(_imported)
 
 
 def _import(name: str, given: str) -> str:
-    """Import a module; returns its file, or "" if it has none."""
+    """Import a module; return its file, or "" if it has none."""
     try:
         return import_module(name).__file__ or ""
     except Exception as error:
@@ -88,13 +90,13 @@ def _import(name: str, given: str) -> str:
 
 
 def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **options: Any) -> Any:
-    """Make something where the user's modules may not have been imported: in a worker."""
+    """Import the user's modules in a worker process, then call ``make`` with the options."""
     import_modules(modules)
     return make(**options)
 
 
 def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:
-    """Refuse to open a run that has used modules of its user's, unless ``import=`` is given.
+    """Refuse to open a run that has used modules of its own, unless ``import=`` is given.
 
     Args:
         config: Configuration of the run.
@@ -102,7 +104,7 @@ def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, 
         run: Folder of the run, for the message.
 
     Raises:
-        CommandLineError: If it has; the message says what to type.
+        CommandLineError: If the run has used modules and ``given`` is None.
     """
     noted = config.get(KEY) or []
     if given is None and noted:

@@ -1,4 +1,4 @@
-"""A folder of runs as figures, tables and one page."""
+"""Reports: figures and tables of a folder of runs, on one page."""
 
 from safe_rl.reporting.page import Report, build_report, write_report
 

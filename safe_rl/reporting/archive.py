@@ -1,8 +1,8 @@
-"""Runs found below a folder: in folders of their own, and in archives.
+"""Find the runs below a folder, in folders of their own and in archives; write archives.
 
-An archive has two files: ``runs.json.gz`` with a line per run, its configuration and its notes, and
-``rows.csv.gz`` with the epochs of all runs, with the run in the first column. What cannot be read
-is left out with a reason.
+An archive has two files. ``runs.json.gz`` has a line per run, with its configuration and notes.
+``rows.csv.gz`` has the epochs of all runs, with the run in the first column. Files that cannot be
+read are left out, with a reason.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
 
     Args:
         root: The folder.
-        unfinished: Whether runs count as finished that have not come to their configured end.
+        unfinished: Whether runs count as finished that have not reached their configured end.
 
     Returns:
-        Runs that have finished an epoch, and folder or file -> why it was left out.
+        Runs that have finished an epoch, and folder or file -> the reason why it is left out.
 
     Raises:
         FileNotFoundError: If there is no such folder, or no run in it.
@@ -68,20 +68,20 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
 
 @contextmanager
 def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
-    """Note why something is left out; everything else is reported."""
+    """Note the error of the block as the reason why a folder or file is left out."""
     try:
         yield
-    except Exception as error:  # files of anybody may hold anything
+    except Exception as error:  # files of unknown origin may hold anything
         is_told = isinstance(error, ValueError | OSError)
         reason = error if is_told else f"{path.name} is not as a run writes it ({error!r})"
         skipped[path] = clean(reason)
 
 
 def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
-    """What a run's folder holds; notes that cannot be read are left out."""
+    """Read a run from its folder; notes that cannot be read are left out."""
 
     def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
-        """What a file holds that passes a check; None of any other."""
+        """The content of a file; None if there is no file, or it fails the check."""
         with _noted(path, skipped):
             if path.exists():
                 content = (read_json if path.suffix == ".json" else read_yaml)(path)
@@ -95,12 +95,12 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
     table = read_table(folder.table)
     runtime = select(read(folder.surroundings), "hydra", "runtime")
     start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
-    # of --config-dir, and of Python's config_dir
+    # folders of --config-dir, and of config_dir in Python
     directories = [s["path"] for s in sources if s["provider"].endswith("command-line")]
     before = select(read(folder.composed), "frames")
     notes = {
         "overrides": read(folder.overrides),
-        # as a person would type them where the run was started
+        # relative to the folder where the run was started, as a user would type them
         "config_dirs": [os.path.relpath(p, start) if start else p for p in directories],
         "frames_before": before if before != config.get("frames") else None,
         "certificate": read(folder.certificate, read_certificate),
@@ -116,10 +116,10 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
 
 
 def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
-    """Add runs to an archive, or bring them up to date in it, each by its path below ``root``.
+    """Add runs to an archive, or update them there; their names are their paths below ``root``.
 
     Raises:
-        ValueError: If the archive is among the runs or they in it, or is no archive.
+        ValueError: If one folder lies in the other, or the archive is none.
         OSError: If it cannot be read or written.
     """
     here, there = root.resolve(), archive.resolve()
@@ -131,7 +131,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
 
 
 def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
-    """Write runs by their names; the same runs make the same bytes.
+    """Write runs, by name, as an archive; equal runs give equal bytes.
 
     Examples:
         >>> folder, table = getfixture("tmp_path"), {"steps": [1000.0, 2000.0]}
@@ -155,10 +155,10 @@ def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
 
 
 def read_archive(folder: Path) -> dict[str, Run]:
-    """Read the runs of an archive by their names; they are not checked.
+    """Read the runs of an archive, by name, without checking them.
 
     Raises:
-        ValueError: If the files are not those of an archive.
+        ValueError: If the files are no archive.
     """
     try:
         entries = json.loads(gzip.decompress((folder / RUNS).read_bytes()))
@@ -172,11 +172,11 @@ def read_archive(folder: Path) -> dict[str, Run]:
 
 
 def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
-    """Tables by run, each with the columns in which it has a number."""
+    """The tables by run, each with the columns in which the run has a number."""
     pandas = import_extra("pandas", "report")
     rows = pandas.read_csv(path, dtype=defaultdict(lambda: "float", run="str"))
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
-        # before its first episode has ended, a run has no number of these
+        # before its first episode has ended, a run has no number in these
         always = own.columns.isin(["episode_return", "episode_cost"])
         yield name, own.loc[:, always | own.notna().any()].to_dict("list")

@@ -32,7 +32,7 @@ _MULTIPLES = 6  # small panels beside each other
 
 
 class Average(NamedTuple):
-    """A quantity over training: its mean over seeds and the ends of its 95 % interval.
+    """A quantity over training: its mean over seeds and the bounds of its 95 % interval.
 
     All have shape [points]; the interval is NaN with a single seed.
     """
@@ -46,11 +46,11 @@ class Average(NamedTuple):
 def average(
     runs: Sequence[Run], column: str, *, smooth: bool, with_band: bool = True
 ) -> Average | None:
-    """Average a column of the runs' tables over seeds; None if one has no value, or there is none.
+    """Average a column of the runs' tables over seeds; None without runs, or if one has no value.
 
-    The curve ends where the first of the runs does. Between epochs, and over those in which no
-    episode finished, values are interpolated. With ``smooth`` values are moving means over as many
-    epochs as final figures; without the band, most of the time is saved.
+    The curve ends with the shortest run. Between epochs, and where no episode finished, values are
+    interpolated. With ``smooth`` values are moving means over as many epochs as final figures.
+    Without the band, the interval is NaN, which saves most of the time.
     """
     series = []
     for run in runs:
@@ -74,10 +74,10 @@ def average(
 def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> Figure:
     """Draw return, episode cost and cost rate over steps, a row per environment.
 
-    Lines are means over seeds and bands their 95 % intervals; return and episode cost are means of
-    an epoch and those before it, as many as final figures have. Limits d are dashed, and so is
-    d / T_ep beside the cost rate. Runs that have not come to their end are dotted, one by one.
-    An environment has a row for each number of steps, and for each cost with a limit.
+    Lines are means over seeds, bands their 95 % intervals. Return and episode cost are moving means
+    over as many epochs as final figures. Limits d are dashed, and so is d / T_ep in the panel of
+    the cost rate. Each unfinished run is a dotted line of its own. An environment has a row for
+    each number of steps and each cost with a limit.
     """
     groups: dict[tuple[str, int], list[Experiment]] = {}
     for e in experiments:
@@ -110,8 +110,8 @@ def draw_small_multiples(
 ) -> Figure:
     """Draw return, episode cost and cost rate of many algorithms, a column of panels for each.
 
-    The other algorithms are grey in the background. Costs above four times the highest limit are
-    cut off, if all curves end below it. All experiments have one environment and number of steps.
+    The other algorithms are grey in the background. If all curves end below four times the highest
+    limit, higher values are cut off. All experiments have one environment and number of steps.
     """
     columns: dict[str, list[Experiment]] = {}
     for experiment in experiments:
@@ -150,7 +150,7 @@ def draw_small_multiples(
 
 
 def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[float]) -> None:
-    """One scale for all panels of a quantity; those without a curve are hidden."""
+    """Set one scale for all panels of a quantity, and hide those without a curve."""
     used = [axis for axis in panels if axis.has_data()]
     low, high = zip(*(axis.get_ylim() for axis in used), strict=True)
     cut = 4 * max(limits, default=0.0)
@@ -164,7 +164,7 @@ def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[flo
 def limits_of(
     experiments: Iterable[Experiment], key: str, axes: Sequence[Any]
 ) -> list[tuple[Any, float]]:
-    """Panels of episode cost and cost rate, and the heights of limits in them: d and d / T_ep."""
+    """Pairs of a panel (episode cost, cost rate) and the height of a limit in it: d, d / T_ep."""
     pairs = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
     return [
         *((axes[1], limit) for limit, _ in pairs),
@@ -173,7 +173,7 @@ def limits_of(
 
 
 def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
-    """Cost keys with a limit, or the aggregate cost where none has one."""
+    """Cost keys with a limit, or the aggregate cost if there are none."""
     limited = {key for experiment in experiments for key in experiment.limits}
     return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
 
@@ -187,7 +187,7 @@ def _curves(runs: Sequence[Run], key: str, *, with_band: bool = True) -> list[Av
 def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
     """Draw return, episode cost and cost rate of an experiment into a panel each.
 
-    The finished runs become a mean and its interval, others a line each.
+    Finished runs are drawn as a mean and its interval, each unfinished run as a line.
     """
     name = literal(experiment.label)
     looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]
@@ -208,7 +208,7 @@ def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], styl
 
 
 def set_axes(axes: Sequence[Axes], ticks: int = 6) -> None:
-    """Scales, ticks and grid of a row of panels: return, episode cost and cost rate."""
+    """Set scales, ticks and grid of a row of panels: return, episode cost and cost rate."""
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.xaxis.set_major_locator(MaxNLocator(ticks))

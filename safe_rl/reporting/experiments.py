@@ -1,4 +1,4 @@
-"""Runs that differ in nothing but the seed: experiments, and their names."""
+"""Experiments, which are groups of runs that differ only in the seed, and their names."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 
 Settings = Mapping[str, Hashable]
 
-# settings that a name has wherever they differ, whether or not a command line has them
+# settings that names contain wherever they differ, even if no command line sets them
 _ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
 
 
@@ -32,10 +32,10 @@ class Experiment:
     """One algorithm with one set of settings on one environment.
 
     Attributes:
-        environment: Name of the environment, with what was changed of it.
-        title: Name of the algorithm, without its settings.
-        settings: What tells it from other experiments with this algorithm.
-        benchmark: Name in the suite if the environment is exactly that one, else None.
+        environment: Name of the environment, with the keys that were changed.
+        title: Name of the algorithm, without settings.
+        settings: Settings that distinguish it from other experiments with this algorithm.
+        benchmark: Name of the environment in the suite if no key was changed, else None.
         runs: One per seed.
     """
 
@@ -46,7 +46,7 @@ class Experiment:
     runs: tuple[Run, ...]
 
     def name_without(self, *groups: str) -> str:
-        """Name of the algorithm, with its settings but for those of some groups."""
+        """Name of the algorithm, with its settings except those of some groups."""
         kept = {k: v for k, v in self.settings.items() if k.partition(".")[0] not in groups}
         return self.title + _in_brackets(kept)
 
@@ -57,12 +57,12 @@ class Experiment:
 
     @property
     def label(self) -> str:
-        """The name in pictures of one number of steps."""
+        """The name in pictures with one number of steps: without ``frames``."""
         return self.name_without("frames")
 
     @property
     def family(self) -> str:
-        """The label without limits: the same for one algorithm under several limits."""
+        """The label without limits: equal for one algorithm under several limits."""
         return self.name_without("frames", "cost_limits")
 
     @property
@@ -82,12 +82,12 @@ class Experiment:
 
     @property
     def has_published_limit(self) -> bool:
-        """Whether it has the limit, and only that, with which results were published."""
+        """Whether its only limit is that of the published results."""
         return self.limits == {"cost": COST_LIMIT} and not self.limits_of_other_measures
 
     @property
     def limits_of_other_measures(self) -> list[str]:
-        """Cost keys whose limit is on something else than the mean cost of an episode."""
+        """Cost keys whose limit is on another measure than the mean cost of an episode."""
         return [k for k in self.limits if any(run.limits_another_measure(k) for run in self.runs)]
 
     @property
@@ -97,12 +97,12 @@ class Experiment:
 
     @property
     def finished(self) -> tuple[Run, ...]:
-        """Runs that have come to their configured end."""
+        """Its finished runs."""
         return tuple(run for run in self.runs if run.is_finished)
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Environment steps of its finished runs, ascending, each number once."""
+        """Environment steps of its finished runs, ascending, without repetitions."""
         return tuple(sorted({run.length for run in self.finished}))
 
     @property
@@ -121,13 +121,13 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
     Returns:
-        Experiments, and folder -> why a run was left out.
+        Experiments, and folder -> the reason why a run is left out.
     """
     environments = _environment_names(runs, suite)
     settings = _settings_of_names(runs, environments)
     cells: dict[tuple[str, str], dict[int, Experiment]] = defaultdict(dict)
     skipped: dict[Path, str] = {}
-    # of a seed the run is kept that has come further, then the last by name
+    # of several runs with one seed, the longest is kept; among equal ones the last by name
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         environment, title = environments[run.directory], clean(title_of(run.algorithm), 80)
         benchmark = suite.name_of(run.config["env"])
@@ -143,7 +143,7 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:
-    """Benchmark environments first, algorithms as in the paper, variants after each other."""
+    """Sort key: benchmark environments first, algorithms as in the paper, then by name."""
     places = {name: place for place, name in enumerate([*REFERENCE, *ALGORITHMS])}
     environment = places.get(experiment.benchmark or "", 99), experiment.environment
     return *environment, places.get(experiment.base, 99), experiment.algorithm
@@ -152,7 +152,7 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
 def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
     """Folder -> name of the environment, with the keys that differ from the suite's.
 
-    Other environments are named with the keys in which those of the same name differ.
+    Names of other environments have the keys in which environments of that name differ.
     """
     alike: dict[str, list[Settings]] = defaultdict(list)
     for run in runs:
@@ -172,10 +172,10 @@ def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
 def _settings_of_names(
     runs: Sequence[Run], environments: Mapping[Path, str]
 ) -> dict[Path, Settings]:
-    """Folder -> settings that its name has.
+    """Folder -> the settings in the name of its run.
 
-    These are what a person has set and what differs; on an environment where this does not tell
-    all apart, everything that differs between runs of the algorithm.
+    These are settings that differ between runs of the algorithm, and that a user has set. If they
+    do not distinguish all experiments on an environment, all settings that differ are used there.
     """
     found: dict[Path, Settings] = {}
     by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
@@ -204,7 +204,7 @@ def _settings_of_names(
 
 
 def _is_given(key: str, run: Run) -> bool:
-    """Whether a person has set a key, or chosen the group that it belongs to."""
+    """Whether a user has set a key, or chosen the group that it belongs to."""
     said = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
     return key.partition(".")[0] in _ALWAYS_NAMED or any(
         key == one or key.startswith(f"{one.partition('@')[0]}.") for one in said
@@ -212,7 +212,7 @@ def _is_given(key: str, run: Run) -> bool:
 
 
 def title_of(algorithm: str) -> str:
-    """How the field writes the name of one of the package's algorithms; others stay as they are.
+    """The usual spelling of the name of a package's algorithm; other names do not change.
 
     Examples:
         >>> title_of("c_trpo"), title_of("sac_lagrangian"), title_of("my_idea")
@@ -225,18 +225,18 @@ def title_of(algorithm: str) -> str:
 
 
 def _settings(run: Run) -> dict[str, Hashable]:
-    """What tells a run's algorithm from others of the same name."""
+    """The settings that may distinguish a run's algorithm from others of the same name."""
     frames, settings = run.config["frames"], experiment_of(run.config)
-    # some only say again how long the run is
+    # some keys only repeat the length of the run
     repeated = {key for key, v in settings.items() if v == frames and role_of(key) is Role.LENGTH}
     left_out = repeated - {"frames"} | {key for key in settings if key.startswith("env.")}
     return {key: value for key, value in settings.items() if key not in left_out}
 
 
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
-    """Keys that differ within a cell, except those whose values follow from another key.
+    """Keys that differ within a cell, except those whose values follow from other keys.
 
-    A value may follow from ``preset``, or from the ``_target_`` of the group of its key.
+    A value may follow from ``preset``, or from the ``_target_`` of a group above its key.
 
     Examples:
         >>> small, large = {"preset": "a", "model.width": 1}, {"preset": "b", "model.width": 2}
@@ -249,7 +249,7 @@ def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
 
 
 def _follows(key: str, cell: Sequence[Settings]) -> bool:
-    """Whether a key's value is settled by those of the keys that stand for it."""
+    """Whether a key's value follows from ``preset`` and the ``_target_`` of groups above it."""
     names = key.split(".")
     groups = [".".join([*names[:depth], "_target_"]) for depth in range(1, len(names))]
     above = [other for other in ("preset", *groups) if other != key]
@@ -258,7 +258,7 @@ def _follows(key: str, cell: Sequence[Settings]) -> bool:
 
 
 def _in_brackets(settings: Settings) -> str:
-    """Settings as on the command line, ``" (1M steps, cost ≤ 10)"``, or nothing."""
+    """Settings in brackets, ``" (1M steps, cost ≤ 10)"``; "" without settings."""
     texts = []
     for key, value in settings.items():
         if key.endswith("._target_"):
@@ -274,7 +274,7 @@ def _in_brackets(settings: Settings) -> str:
 
 
 def _as_override(value: Hashable) -> str:
-    """A value as a command line has it: ``[10,a,null]``."""
+    """A value as on a command line: ``[10,a,null]``."""
     if isinstance(value, tuple):
         return f"[{','.join(map(_as_override, value))}]"
     if isinstance(value, bool) or value is None:

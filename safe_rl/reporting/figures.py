@@ -1,4 +1,4 @@
-"""Pictures of final scores and of variations; what all pictures share: styles, legends, files."""
+"""Pictures of final scores and variations; styles, legends and files of all pictures."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ __all__ = [
     *("draw_fronts", "draw_variations", "literal", "save", "set_grid"),
 ]
 
-# colours and markers of the package's algorithms, those of the paper first, in colours of Okabe
-# and Ito that colour-blind readers can tell apart
+# colours and markers of the package's algorithms; those of the paper come first, in colours of
+# Okabe and Ito that colour-blind readers can distinguish
 _LOOKS = (
     *(("#e69f00", "o"), ("#0072b2", "o"), ("#d55e00", "s"), ("#009e73", "s"), ("#cc79a7", "D")),
     *(("#999933", "p"), ("#17becf", "<"), ("#6699cc", "d"), ("#7f7f7f", ">"), ("#bcbd22", "v")),
@@ -38,22 +38,22 @@ _LOOKS = (
     *(("#b15928", "<"), ("#fb9a99", "P"), ("#a6cee3", "*"), ("#000000", ">")),
 )
 LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth": 1.0}
-"""How limits are drawn."""
+"""Style of the lines at limits."""
 WIDTH = 12.0
-"""Of a figure, in inches."""
+"""Width of a figure [inch]."""
 _LEGEND, _LONGEST_LABEL = 140, 60  # of a legend and a line of it: letters beside each other
 _PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; beside each other
 _NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation does not have
 
 
 class Style(NamedTuple):
-    """How an experiment is drawn; all of one algorithm have its colour and its marker.
+    """How an experiment is drawn; experiments with one algorithm share colour and marker.
 
     Attributes:
-        colour: Of lines and markers.
-        marker: Matplotlib's sign of it.
-        line: Style of its line; variants of an algorithm have different ones.
-        is_filled: Whether markers are filled. Of variants in more than limits, those of the first.
+        colour: Colour of lines and markers.
+        marker: Matplotlib's name of the marker.
+        line: Style of the line; variants of an algorithm have different ones.
+        is_filled: Whether markers are filled: only those of an algorithm's first family are.
     """
 
     colour: str
@@ -63,7 +63,7 @@ class Style(NamedTuple):
 
     @property
     def point(self) -> dict[str, Any]:
-        """Keywords of Matplotlib for a marker."""
+        """Matplotlib's keyword arguments of the marker."""
         face = self.colour if self.is_filled else "white"
         return {"marker": self.marker, "color": self.colour, "markerfacecolor": face}
 
@@ -86,20 +86,20 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
 
 
 def literal(text: str) -> str:
-    """A name as Matplotlib draws it letter by letter: no mathematics, and shown in legends."""
+    """A name for Matplotlib: not read as mathematics, and not hidden in legends."""
     return text.replace("$", r"\$").replace("_", "\N{ZERO WIDTH SPACE}_", text[:1] == "_")
 
 
 def set_grid(axis: Axes) -> None:
-    """Faint lines in the background of a panel, and no frame above and to the right of it."""
+    """Add a faint grid to a panel, and remove the top and right sides of its frame."""
     axis.grid(alpha=0.25)
     axis.spines[["top", "right"]].set_visible(False)
 
 
 def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
-    """One legend for all panels, below the figure, which grows by its height.
+    """Add one legend for all panels below the figure, whose height increases by the legend's.
 
-    It has as many columns as there is room for, and breaks long labels into lines.
+    The legend has as many columns as fit, and breaks long labels into lines.
     """
     pairs = (pair for axis in axes for pair in zip(*axis.get_legend_handles_labels(), strict=True))
     handles = {fill(label, _LONGEST_LABEL, break_on_hyphens=False): h for h, label in pairs}
@@ -115,7 +115,7 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, SVG or PDF, as its file is called."""
+    """Write a figure as PNG, SVG or PDF, by the suffix of the file; return the path."""
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=120)
     return path
@@ -126,9 +126,9 @@ Final = tuple[Experiment, Record]
 
 
 def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
-    """Experiments that can be compared, by what stands above their panel.
+    """Experiments that can be compared, by the title of their panel.
 
-    At least two with a return and a cost on the same environment after equally many steps.
+    These are at least two with a return and a cost, on one environment after equally many steps.
     """
     groups: dict[tuple[str, ...], list[Final]] = defaultdict(list)
     for experiment, record in finals:
@@ -142,9 +142,9 @@ def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
 def draw_fronts(groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style]) -> Figure:
     """Draw final returns against final costs, a panel per group of :func:`compared`.
 
-    A point is an experiment, with the standard deviations over its seeds. A line in an
-    algorithm's colour joins its experiments under several limits, which stand beside their points.
-    The grey line joins those that no other one beats in both.
+    A point is an experiment, with the standard deviations over its seeds. A line in an algorithm's
+    colour joins its experiments under several limits; the limits are written beside the points.
+    The grey line is the Pareto front.
     """
     columns = min(3, len(groups))
     rows = -(-len(groups) // columns)
@@ -195,7 +195,7 @@ def draw_variations(
 ) -> None:
     """Draw return and costs with their intervals over the values of every row.
 
-    The band across a panel is the environment as trained on, which is the first of the rows; limits
+    The first row is the environment as trained on; its interval is a band across the panels. Limits
     are dashed. Without limits, ``cost`` is drawn.
     """
     (_, trained), *varied = rows

@@ -1,4 +1,4 @@
-"""What runs have left in their folders: evaluations, certificates, commands."""
+"""Tables of the contents of runs' folders: evaluations, certificates, commands."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def _each_run(
 
 
 def _names(records: Sequence[Record], start: str) -> list[str]:
-    """Ends of the names of all fields that start so."""
+    """The names of all fields with a prefix, without it."""
     fields = dict.fromkeys(name for record in records for name in record)
     return [name.removeprefix(start) for name in fields if name.startswith(start)]
 
 
 def run_table(experiments: Sequence[Experiment]) -> Table:
-    """Every run with its final scores, its folder and the command that does it again."""
+    """Every run with its final scores, its folder and the command that repeats it."""
     records = [
         {
             **where,
@@ -62,7 +62,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
 
 
 def duration(hours: float) -> str:
-    """A time as people say it.
+    """A duration in minutes or hours.
 
     Examples:
         >>> duration(0.21), duration(2.5)
@@ -72,7 +72,7 @@ def duration(hours: float) -> str:
 
 
 def evaluation_table(experiments: Sequence[Experiment]) -> Table:
-    """What ``python -m safe_rl.evaluate`` has found of the runs."""
+    """The results of ``python -m safe_rl.evaluate`` of all runs."""
     records = [
         {**where, **found, "other_measures": e.limits_of_other_measures}
         for where, e, run in _each_run(experiments)
@@ -89,7 +89,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         **({"cost": "{cost}"} if len(keys) > 1 else {}),
         "$J_c$": interval("mean", 1),
         "$d$": "{limit:g}",
-        # of many episodes a few are not none
+        # with a decimal: a few of many episodes are not shown as 0 %
         "P($C$ > $d$)": "{over:.1%}",
         "CVaR": "{cvar_alpha:.1%}: " + interval("cvar", 1),
     }
@@ -98,7 +98,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
         fields |= {f"mean{end}": f"episode_{{}}{end}", f"cvar{end}": f"cvar_{{}}{end}"}
 
     def over(row: Record) -> str:
-        # of another measure than the mean these episodes do not say whether it keeps the limit
+        # a limit on another measure than the mean is not judged by these episodes' mean
         judged = row.get("key") not in row["other_measures"]
         return "bad" if judged and row.get("mean", 0.0) > row.get("limit", inf) else ""
 
@@ -107,7 +107,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 
 
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
-    """Which runs have a checkpoint that is certified to keep the limits."""
+    """The certificates of all runs that have one."""
     runs = _each_run(experiments)
     records = [{**where, **run.certificate} for where, _, run in runs if run.certificate]
     columns = {

@@ -1,4 +1,4 @@
-"""The sections of a report, and their files: tables, pictures, and one page of HTML."""
+"""The sections of a report, and its files: tables, pictures, and one page of HTML."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Report", "Section", "build_report", "write_report"]
 
-_MOST_ROWS = 6  # of a picture of learning curves: what a printed page holds
+_MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed page
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
 
 
 class Drawing(NamedTuple):
-    """A picture: stem of its file, heading, and what it shows, for those who cannot see it."""
+    """A picture: stem of its file, heading, figure, and alternative text."""
 
     name: str
     title: str
@@ -48,7 +48,7 @@ Styles = Mapping[str, figures.Style]
 
 
 class Section(NamedTuple):
-    """A part of the report: its key in ``texts.yaml``, its heading, what is in it."""
+    """A part of the report: its key in ``texts.yaml``, its heading, its tables and pictures."""
 
     name: str
     title: str
@@ -60,9 +60,9 @@ class Report:
     """The contents of a report on a folder of runs.
 
     Attributes:
-        experiments: Runs, grouped.
-        sections: What is said of them; none is empty.
-        skipped: Folder or file -> why it was left out.
+        experiments: The runs in groups.
+        sections: The sections of the page; none is empty.
+        skipped: Folder or file -> the reason why it is left out.
     """
 
     experiments: Sequence[Experiment]
@@ -71,7 +71,7 @@ class Report:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs in it."""
+        """All runs of the report."""
         return [run for experiment in self.experiments for run in experiment.runs]
 
 
@@ -83,18 +83,18 @@ def build_report(
     unfinished: bool,
     algorithms: Sequence[str] = (),
 ) -> Report:
-    """Find the runs below a folder and put everything together.
+    """Find the runs below a folder, and make the sections of a report.
 
     Args:
         root: The folder.
         suite: The benchmark.
-        seeds_needed: Finished runs that a slate takes per environment.
+        seeds_needed: Finished runs per environment that a slate needs.
         unfinished: Whether unfinished runs count as finished ones.
-        algorithms: Names in ``conf/algo`` of those to report; empty: all.
+        algorithms: Names in ``conf/algo`` of the algorithms to report; empty: all.
 
     Raises:
         FileNotFoundError: If there is no run.
-        ValueError: If there is no run of one of the algorithms.
+        ValueError: If one of the algorithms has no run.
     """
     runs, skipped = find_runs(root, unfinished=unfinished)
     known = sorted({run.algorithm for run in runs})
@@ -120,7 +120,7 @@ def build_report(
         ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
         ("runs", "Runs", [inventory.run_table(experiments), left_out]),
     ]
-    # a table without a row says nothing
+    # tables without rows are left out
     sections = [
         Section(name, title, [b for b in blocks if not isinstance(b, Table) or b.records])
         for name, title, blocks in parts
@@ -144,7 +144,7 @@ def _fronts(
 
 
 def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
-    """Small multiples where there are many curves; the rest as rows of pictures."""
+    """A picture of small multiples for each group of many curves; the others as rows."""
     what = "Return, episode cost and cost rate"
     rows, drawings = [], []
     for group in _by_environment(experiments):
@@ -171,13 +171,14 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
     """Write a report into a folder: a page, pictures, tables as CSV and all of them in LaTeX.
 
     Args:
-        report: What there is to say.
-        out: The folder, made if need be; files of an earlier report in it are replaced.
+        report: The content.
+        out: The folder; it is made if it does not exist, and files of an earlier report are
+            replaced.
         title: Heading of the page.
-        formats: Of the pictures: png, svg, pdf. PNG is always among them, for the page.
+        formats: Formats of the pictures: png, svg, pdf. PNG is always written, for the page.
 
     Returns:
-        The page, ``report.html``.
+        Path of the page, ``report.html``.
 
     Raises:
         ModuleNotFoundError: If Jinja is missing; the message names the extra.
@@ -207,7 +208,7 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
 
 
 def _places(out: Path) -> Callable[[str], Path]:
-    """Names of files without a suffix, each of which it gives out once."""
+    """A function that turns a name into the path of a file without suffix, never twice the same."""
     taken: set[str] = set()
 
     def place(name: str) -> Path:
@@ -220,7 +221,7 @@ def _places(out: Path) -> Callable[[str], Path]:
 
 
 def _write(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> str:
-    """Write the files of a block; returns the PNG of a picture in base64, for the page."""
+    """Write the files of a block; return the PNG of a picture in base64, for the page."""
     if isinstance(block, Table):
         block.write_csv(place(block.name).with_suffix(".csv"))
     if not isinstance(block, Drawing):
@@ -245,7 +246,7 @@ def _facts(report: Report) -> dict[str, str]:
 
 
 def _symbols(text: str) -> str:
-    r"""HTML of a text with symbols, ``$\bar J_r$``."""
+    r"""A text with symbols such as ``$\bar J_r$`` as HTML."""
 
     def letters(match: re.Match[str]) -> str:
         bar, letter, index = match.groups()

@@ -1,4 +1,4 @@
-"""One training run: its configuration, its table, and what it wrote beside them."""
+"""One training run: its configuration, its table and its other files."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Run:
     """One training run.
 
     Attributes:
-        directory: Its folder; of an archived run the folder that it would have in the archive.
+        directory: Its folder; for an archived run, its name below the archive.
         config: Its configuration, resolved.
         table: Columns of its table; a row per epoch, NaN where there is no number.
-        notes: ``overrides``, ``certificate``, ``code`` and the like, as its files have them.
-        takes_part: Whether it counts as finished before it has come to its end.
+        notes: ``overrides``, ``certificate``, ``code`` and so on, as in its files.
+        takes_part: Whether it counts as finished before it has reached its end.
     """
 
     directory: Path
@@ -38,10 +38,10 @@ class Run:
     takes_part: bool = False
 
     def check(self) -> None:
-        """Refuse a run without what a report needs of every run.
+        """Refuse a run that lacks what a report needs.
 
         Raises:
-            ValueError: If the configuration or the table lacks it.
+            ValueError: If the configuration or the table lacks something.
             Exception: Of any type, if notes are not as a run writes them.
         """
         frames, limits = self.config.get("frames", -1), self.config.get("cost_limits") or {}
@@ -84,7 +84,7 @@ class Run:
 
     @property
     def episode_length(self) -> int | None:
-        """T_ep in steps, if the configuration says it."""
+        """T_ep in steps, or None if the configuration does not have it."""
         found = (self.config["env"].get(key) for key in ("num_steps", "max_episode_steps"))
         return next((n for n in found if isinstance(n, int) and n > 0), None)
 
@@ -95,7 +95,7 @@ class Run:
 
     @property
     def length(self) -> int:
-        """Environment steps that were configured; of an unfinished run, those it has taken."""
+        """The configured number of environment steps; for an unfinished run, those so far."""
         configured = self.config["frames"]
         return int(configured) if 0 < configured <= self.steps else self.steps
 
@@ -111,13 +111,13 @@ class Run:
 
     @property
     def overrides(self) -> list[str] | None:
-        """What its command line said, if Hydra has recorded it."""
+        """The overrides of its command line, or None if they are not recorded."""
         said = self.notes.get("overrides")
         return [clean(override) for override in said] if isinstance(said, list) else None
 
     @property
     def command(self) -> str | None:
-        """The command line that does it again, with what was not in its overrides."""
+        """The command that repeats it, or None if its overrides are not recorded."""
         overrides = self.overrides
         if overrides is None:
             return None
@@ -129,42 +129,42 @@ class Run:
 
     @cached_property
     def evaluations(self) -> list[dict[str, Any]]:
-        """What ``safe_rl.evaluate`` has found, a record each, see `read_evaluation`."""
+        """Its evaluations, each as a record, see `read_evaluation`."""
         return [read_evaluation(found) for found in self.notes.get("evaluations", ())]
 
     @cached_property
     def certificate(self) -> dict[str, Any] | None:
-        """Which of its checkpoints is certified, see `read_certificate`."""
+        """Its certificate as a record, see `read_certificate`, or None."""
         return read_certificate(self.notes["certificate"]) if "certificate" in self.notes else None
 
     @cached_property
     def code(self) -> str | None:
-        """By which version and commit it was carried out, see `read_code`."""
+        """The version and commit of its code, see `read_code`, or None."""
         return read_code(self.notes["code"]) if "code" in self.notes else None
 
     def column(self, name: str) -> np.ndarray:
-        """A column in the epochs in which an episode finished, shape [epochs]; NaN without one."""
+        """A column in the epochs in which an episode finished, shape [epochs]; NaN if missing."""
         known = np.isfinite(self.table["episode_return"])
         return np.array(self.table.get(name, [math.nan] * known.size), dtype=float)[known]
 
     def final(self, cost_keys: Sequence[str]) -> dict[str, float]:
-        """Final J_r, J_c and ρ_c by column name (section 5.1), of the costs that it has."""
+        """Final J_r, J_c and ρ_c by column name (section 5.1), for the costs that it has."""
         return final_figures(self.table, [key for key in cost_keys if f"{key}_rate" in self.table])
 
     def excess(self, key: str) -> float:
-        """What the limit of a cost judges, minus d: a mean over the last epochs."""
+        """Violation of a cost's limit, a mean over the last epochs; negative within it."""
         return violation(self.final([key]), key, self.limits[key])
 
     def limits_another_measure(self, key: str) -> bool:
-        """Whether the limit of a cost is on something else than the mean cost of an episode."""
+        """Whether the limit of a cost is on another measure than the mean cost of an episode."""
         return judges_another_measure(self.table, key, self.limits[key])
 
 
 def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
-    """A certificate as a record of tables; errors of any type if it is none.
+    """A certificate as a record of tables; any exception if the content is no certificate.
 
-    Its ``checkpoint`` is the number of steps, or None where no policy is certified;
-    ``bound_<name>`` and ``most_<name>`` are the bound on a mean, and what it has to keep.
+    Its ``checkpoint`` is the number of steps, or None if no policy is certified. ``bound_<name>``
+    is the upper bound on a mean, and ``most_<name>`` its limit.
     """
     checkpoint, bounds = content["checkpoint"], content["bounds"]
     return {
@@ -180,7 +180,7 @@ def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
-    """An evaluation as a record of tables: every estimate and the ends of its interval."""
+    """An evaluation as a record of tables: every estimate and the bounds of its interval."""
     manner = [str(content["name"])] if content.get("name") else []
     manner.append("mean actions" if content["deterministic"] else "sampled actions")
     manner += [f"{key}={value}" for key, value in content["env"].items()]
@@ -200,7 +200,7 @@ def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_code(content: Sequence[Mapping[str, Any]]) -> str:
-    """By which code a run was carried out, and from which step on by which other one."""
+    """The version and commit of a run's code; of later ones, also the steps at which they began."""
     parts = []
     for entry in content[:9]:
         words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
@@ -211,7 +211,7 @@ def read_code(content: Sequence[Mapping[str, Any]]) -> str:
 
 
 def select(node: Any, *keys: str) -> Any:
-    """What lies below keys of nested mappings; None where there is nothing."""
+    """The value at a path of keys in nested mappings, or None."""
     for key in keys:
         node = node.get(key) if isinstance(node, dict) else None
     return node

@@ -1,4 +1,4 @@
-"""Final scores of experiments, what learning them has cost, and normalised scores."""
+"""Tables of final scores, of costs during learning, and of normalised scores."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
 
 
 def _critic_bias(run: Run) -> dict[str, float]:
-    """By how much cost critics predicted too much over the last epochs, of each cost with one."""
+    """Mean bias of every cost critic over the last epochs; positive if it predicts too much."""
     names = [name for name in run.table if name.startswith("critic_bias_")]
     known = {name: np.array(run.table[name])[final_rows(run.table)] for name in names}
     return {k: float(np.nanmean(v)) for k, v in known.items() if np.isfinite(v).any()}
@@ -65,7 +65,7 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _published(experiment: Experiment) -> dict[str, Any]:
-    """Values printed elsewhere for the same environment and algorithm."""
+    """Published values for the same environment and algorithm."""
     if experiment.is_continued or not experiment.has_published_limit:
         return {}
     paper = experiment.reference if experiment.base == "ppo" else None
@@ -75,7 +75,7 @@ def _published(experiment: Experiment) -> dict[str, Any]:
 
 
 def final_table(experiments: Sequence[Experiment]) -> Table:
-    """Final scores on one environment, with what others have published beside them."""
+    """Final scores on one environment, with published values beside them."""
     environment, keys = experiments[0].environment, cost_keys_of(experiments)
     records = [final_record(experiment, keys) for experiment in experiments]
     fields = {"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"}
@@ -112,9 +112,9 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
 def _final_marks(
     records: Sequence[Record], rivals: Mapping[str, Any]
 ) -> dict[str, Callable[[Record], str]]:
-    """What is over its limit, and the best of what is not, column by column.
+    """Column -> marks of costs over their limits, and of the best scores that keep them.
 
-    Experiments are ranked with those of equal rivals: the lengths of training, and the limits.
+    Only experiments with equal ``rivals`` (lengths of training, limits) are compared.
     """
 
     def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
@@ -134,7 +134,7 @@ def _final_marks(
 
 
 def learning_table(experiments: Sequence[Experiment]) -> Table | None:
-    """What learning has cost on one environment, if anything on it has a limit."""
+    """Costs during learning on one environment; None if no experiment has a limit."""
     experiments = [e for e in experiments if e.limits]
     if not experiments:
         return None
@@ -181,11 +181,11 @@ def _learning_figures(run: Run) -> dict[str, float]:
 def complete_slates(
     experiments: Sequence[Experiment], needed: int
 ) -> Iterator[tuple[str, list[list[Experiment]]]]:
-    """Slates that are complete for an algorithm or more, and what all have in common.
+    """Slates that one algorithm or more has complete, and the environments that all share.
 
-    Yields the name, and for each algorithm with as many finished runs per environment as are needed
-    its experiments, one per environment, with a limit on ``cost``. Runs that started from another
-    run's networks do not count.
+    Yields the name of a slate, and for each algorithm with at least ``needed`` finished runs per
+    environment its experiments, one per environment, with a limit on ``cost``. Runs that started
+    from another run's networks do not count.
     """
     own: dict[str, dict[str, Experiment]] = {}
     for e in experiments:
@@ -214,7 +214,7 @@ def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.nd
         assert e.reference is not None
         finals = [run.final(["cost"]) for run in e.finished]
         returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
-        # J_c, or what the run compares with the limit in its place
+        # J_c, or the other measure that the run compares with the limit
         limit = e.limits["cost"]
         judged = limit + np.array([run.excess("cost") for run in e.finished])
         scores = measures.normalise(returns, judged, rates, limit=limit, reference=e.reference)
@@ -246,9 +246,9 @@ def _record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
 
 
 def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
-    """A slate of `complete_slates` as the paper's Tables 1 and 2, published values beside ours."""
+    """A slate of `complete_slates` as in the paper's Tables 1 and 2, with published values."""
     records = [_record(slate, experiments) for experiments in members]
-    # what has to be equal in two that are compared
+    # only algorithms for which these are equal are compared
     rivals = {m[0].algorithm: [(e.lengths, e.limits["cost"]) for e in m] for m in members}
     columns = {"algorithm": "{algorithm}", "runs": "{runs:d}"}
     columns["steps"] = "{fewest_steps:,}| to {most_steps:,}"

@@ -1,4 +1,4 @@
-"""Tables of a report: records for CSV, and what a reader sees in HTML and LaTeX."""
+"""Tables of a report: records for CSV, and rows for HTML and LaTeX."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _LATEX = str.maketrans(
     | {"±": r"$\pm$", "≤": r"$\leq$", "…": r"\dots{}", "—": "--", "\N{NO-BREAK SPACE}": "~"}
 )
 short_number = EngFormatter(sep="")
-"""A number of steps in few letters, such as 1.5M."""
+"""Formats a number of steps briefly, such as 1.5M."""
 
 
 def clean(text: Any, most: int = 200) -> str:
-    r"""Text as a page can show it: one line, printable, of bounded length.
+    r"""A text that a page can show: one line, printable, of bounded length.
 
     Examples:
         >>> clean("a\nb\x07"), clean("x" * 10, most=4)
@@ -49,16 +49,16 @@ def spread(name: str, decimals: int) -> str:
 
 
 def interval(name: str, decimals: int) -> str:
-    """Template of an estimate and the ends of its interval, see `filled`."""
+    """Template of an estimate and the bounds of its interval, see `filled`."""
     form = f".{decimals}f"
     return f"{{{name}:{form}}}| [{{{name}_low:{form}}}, {{{name}_high:{form}}}]"
 
 
 def filled(template: str, record: Record) -> str:
-    """A template with the fields of a record.
+    """Fill a template with the fields of a record.
 
-    A part of it, up to ``|``, is left out where one of its fields is missing or NaN; without the
-    first part there is a dash instead of all of them.
+    The parts of a template are separated by ``|``. A part is left out if one of its fields is
+    missing or NaN. If that is the first part, the result is a dash.
 
     Examples:
         >>> filled("{x:.1f}| ± {x_std:.1f}", {"x": 1.25}), filled("{x:.1f}", {"y": 1})
@@ -77,9 +77,9 @@ def _is_missing(value: Any) -> bool:
 
 
 def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> list[Record]:
-    """A row per cost of every record that has figures of several costs.
+    """A row for every cost of every record; a record without figures of costs is one row.
 
-    ``fields`` name a field of the rows -> that of the record, with braces for the cost's key.
+    ``fields``: field of a row -> field of the record, with braces in place of the cost's key.
 
     Examples:
         >>> each_cost([{"seed": 0, "rate_a": 1.0}], ["a", "b"], rate="rate_{}")
@@ -97,7 +97,7 @@ def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> 
 
 
 class Cell(NamedTuple):
-    """What a reader sees of one entry; its mark is "best", "bad", or nothing."""
+    """The text of one entry and its mark, which is "best", "bad" or ""."""
 
     text: str
     mark: str
@@ -110,11 +110,12 @@ class Table:
     Attributes:
         name: Stem of the CSV file.
         title: Its heading.
-        columns: Head of a column -> template, see `filled`.
-        records: The CSV file holds all their fields, as numbers.
-        note: Said below it.
-        shown: Records that a reader sees, if not these.
-        marks: Head of a column -> record -> "best" (bold), "bad" (over a limit), or nothing.
+        columns: Title of a column -> template, see `filled`.
+        records: Records, all fields of which are in the CSV file, as numbers.
+        note: Text below the table.
+        shown: Records that the page shows; None: ``records``.
+        marks: Title of a column -> function from a record to "best" (bold), "bad" (over a limit),
+            or "".
 
     Examples:
         >>> table = Table("t", "A table", {"x": "{x:.2f}"}, [{"x": 1.23456}])
@@ -132,11 +133,11 @@ class Table:
 
     @property
     def numbers(self) -> list[bool]:
-        """Which columns are of numbers: those whose first field has a format."""
+        """Whether each column has numbers: then the first field of its template has a format."""
         return [":" in template.partition("}")[0] for template in self.columns.values()]
 
     def rows(self) -> list[list[Cell]]:
-        """What a reader sees."""
+        """The entries that the page shows."""
         return [
             [
                 Cell(clean(filled(text, row), 1000), self.marks.get(title, lambda _: "")(row))
@@ -146,7 +147,7 @@ class Table:
         ]
 
     def latex(self) -> str:
-        """The table in LaTeX, for the package booktabs; what is over its limit has a triangle."""
+        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit."""
         looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
         cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
         frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
@@ -155,8 +156,8 @@ class Table:
         return f"% {clean(self.title)}\n{text}"
 
     def write_csv(self, path: Path) -> None:
-        """Write the records; what is not a number becomes an empty field."""
-        # a spreadsheet would take such a text for a formula
+        """Write the records as CSV; NaN and missing values become empty fields."""
+        # a spreadsheet would take a text with such a beginning for a formula
         risky = lambda value: isinstance(value, str) and value[:1] in {*"=+-@"}  # noqa: E731
         rows = [{k: f"'{v}" if risky(v) else v for k, v in r.items()} for r in self.records]
         frame = import_extra("pandas", "report").DataFrame(rows, dtype=object)
@@ -170,10 +171,10 @@ def mark_best(
     is_able: Callable[[Record], bool],
     rivals: Mapping[str, Any],
 ) -> Callable[[Record], str]:
-    """Mark the best value of a column, and all equal to it, among records that are comparable.
+    """Return a function that marks the best value of a column, and values equal to it.
 
-    Best is ``max`` or ``min`` of those that are able, among algorithms with equal ``rivals``. A
-    record without any rival is not marked.
+    The best is the ``best`` (``max`` or ``min``) among records for which ``is_able`` holds and
+    whose algorithms have equal ``rivals``. A record without rivals is not marked.
     """
 
     def mark(record: Record) -> str:

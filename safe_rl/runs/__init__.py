@@ -1,1 +1,1 @@
-"""What is on disk: folder, table, checkpoints, loggers, curves."""
+"""The files of a run: folder, table, checkpoints, loggers, curves."""

@@ -1,7 +1,7 @@
 """Checkpoints of a run: the last few and the best feasible ones, written atomically.
 
-A file holds facts, and for every part of a run tensors, numbers and plain containers. Reading one
-that another person made runs no code in it.
+A file holds facts, and for every part of a run tensors, numbers and plain containers. Reading a
+file of another person runs no code in it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def read_states(path: Path, names: Collection[str] | None = None) -> dict[str, A
 
     Args:
         path: The checkpoint.
-        names: Those that are needed; None: all that there are.
+        names: Names of the parts to read; None: all.
 
     Raises:
         CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
@@ -60,7 +60,7 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
 
 
 def _restore(path: Path, components: Mapping[str, Stateful]) -> None:
-    """Give parts the states of a checkpoint, all of which are read before the first is changed."""
+    """Restore parts from a checkpoint; all states are read before the first part is changed."""
     states = read_states(path, components)
     for name in sorted(states):
         try:
@@ -73,9 +73,9 @@ def _restore(path: Path, components: Mapping[str, Stateful]) -> None:
 
 
 def best_checkpoint(directory: Path) -> Path | None:
-    """The checkpoint with the highest score in a folder, of equal ones the newest.
+    """The checkpoint with the highest score in a folder, the newest among equal ones.
 
-    One that cannot be read counts as the best: another is not silently put in its place.
+    One that cannot be read counts as the best, so that no other one silently takes its place.
     """
     found = checkpoints_in(directory)
     return max(found, key=lambda path: (_score(path, otherwise=math.inf), path.name), default=None)
@@ -92,16 +92,16 @@ def _score(path: Path, otherwise: float = -math.inf) -> float:
 class CheckpointStore:
     """The checkpoints in a run's folder.
 
-    ``last/`` keeps the newest, ``best/`` those with the highest returns among those in which every
-    cost was within its limit. Names carry the number of environment steps.
+    ``last/`` keeps the newest checkpoints, ``best/`` those with the highest scores. File names
+    contain the number of environment steps.
 
     Args:
         directory: Folder of the checkpoints.
         components: Parts of the run, by name.
         keep_last: Number of newest checkpoints to keep.
         keep_best: Number of best checkpoints to keep.
-        run: JSON-compatible facts of the run that every checkpoint holds: one with others is not
-            resumed from.
+        run: JSON-compatible facts of the run that every checkpoint holds. A checkpoint with other
+            facts is refused when the run is resumed.
 
     Examples:
         >>> import tempfile, torch
@@ -129,20 +129,20 @@ class CheckpointStore:
         self.last = Path(directory) / "last"
         self.best = Path(directory) / "best"
         self._components = dict(components)
-        # exists until the first checkpoint does: with neither, checkpoints were removed
+        # exists until the first checkpoint is written: if both are missing, checkpoints are lost
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
-        # former best ones, which are the best again if the run is resumed from its last checkpoint
+        # former best checkpoints: needed again if the run is resumed from its last checkpoint
         self._displaced: set[Path] = set()
 
     def begin(self) -> None:
-        """Note that a run begins, which has no checkpoint yet."""
+        """Note that a run begins and has no checkpoint yet."""
         self.last.mkdir(parents=True, exist_ok=True)
         self._none_yet.touch()
 
     def save(self, steps: int, facts: Mapping[str, Any] | None = None) -> Path:
-        """Write a checkpoint and drop the oldest that is too many.
+        """Write a checkpoint, and remove the oldest ones beyond ``keep_last``.
 
         Args:
             steps: Environment steps so far.
@@ -166,15 +166,16 @@ class CheckpointStore:
         *,
         states: Mapping[str, Any] | None = None,
     ) -> bool:
-        """Write a checkpoint if there is room, or if ``score`` is higher than that of a kept one.
+        """Write a checkpoint if fewer than ``keep_best`` exist or ``score`` is above a kept one's.
 
-        A replaced one stays until the next `save`: a run resumed from before it has no new one.
+        A replaced checkpoint stays until the next `save`: until then, the run would be resumed from
+        a time before the new one.
 
         Args:
-            steps: Environment steps then.
-            score: What is compared.
+            steps: Environment steps of the policy.
+            score: Score by which the best checkpoints are chosen.
             facts: JSON-compatible facts, readable without loading.
-            states: States of parts by name, where it is not the present ones that are kept.
+            states: States of parts by name; None: the present states.
 
         Returns:
             Whether it was written.
@@ -195,7 +196,7 @@ class CheckpointStore:
         return True
 
     def forget_best(self, steps: Iterable[int]) -> None:
-        """Remove the best checkpoints, if any, of so many environment steps."""
+        """Remove the best checkpoints, if any, with these numbers of environment steps."""
         for number in steps:
             (self.best / checkpoint_name(number)).unlink(missing_ok=True)
 
@@ -213,9 +214,9 @@ class CheckpointStore:
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:
-        """Restore the newest checkpoint, or with a warning the next older one if it is damaged.
+        """Restore the newest checkpoint; if it is damaged, an older one with a warning.
 
-        Best ones newer than the restored one are removed, and so are unfinished checkpoints of a
+        Best checkpoints newer than the restored one are removed, and so are unfinished files of a
         run that was killed while writing.
 
         Args:
@@ -225,8 +226,8 @@ class CheckpointStore:
             The checkpoint, or None if the run was stopped before it had written one.
 
         Raises:
-            CheckpointError: If no checkpoint can be used, with a message about the newest; or if
-                the run has finished epochs and its checkpoints are gone.
+            CheckpointError: If no checkpoint can be used (the message is about the newest), or if
+                the run has finished epochs and its checkpoints are missing.
         """
         _clear_beginnings(self.last)
         failures: list[CheckpointError] = []
@@ -261,12 +262,12 @@ class CheckpointStore:
     def load(
         path: Path, components: Mapping[str, Stateful], run: Mapping[str, Any] | None = None
     ) -> None:
-        """Restore ``components`` from a checkpoint that has them, other parts of it aside.
+        """Restore ``components`` from a checkpoint, which may have further parts.
 
         Args:
             path: The file.
             components: Parts by name; all are read before the first is changed.
-            run: Facts that the run must have had, where its checkpoint names them.
+            run: Facts that must be equal to those in the checkpoint, if it has them.
 
         Raises:
             CheckpointError: If the file is no checkpoint, does not fit the components, or is
@@ -283,7 +284,7 @@ class CheckpointStore:
 
 
 def is_finished(directory: Path, frames: int) -> bool:
-    """Whether the newest whole checkpoint of the run in a folder is after so many steps."""
+    """Whether the newest readable checkpoint of a run was written after ``frames`` steps."""
     for path in reversed(checkpoints_in(RunFolder(directory).checkpoints / "last")):
         with suppress(CheckpointError):
             read_facts(path)

@@ -1,4 +1,4 @@
-"""The learning curves of a run: return, episode cost, cost rate, and λ where there is one."""
+"""The learning curves of a run: return, episode cost, cost rate, and multipliers if any."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch
 
 
 class NotebookFigure(Figure):
-    """A figure that notebooks show, also where pyplot was never imported."""
+    """A figure that notebooks show, also if pyplot was never imported."""
 
     def _repr_png_(self) -> bytes:
         picture = io.BytesIO()
@@ -37,7 +37,7 @@ def draw_learning_curves(
     path: Path,
     title: str = "",
 ) -> None:
-    """Write `learning_curves` into a picture file, replaced atomically.
+    """Write `learning_curves` into a picture file, which is replaced atomically.
 
     Examples:
         >>> import tempfile
@@ -53,7 +53,7 @@ def draw_learning_curves(
         True
     """
     figure = learning_curves(table, cost_limits, episode_length, title)
-    # a viewer that watches the file never sees half a picture
+    # a viewer that watches the file never shows an incomplete picture
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=120)
 
@@ -67,17 +67,17 @@ def learning_curves(
     """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
 
     Limits d are dashed in the second panel, d / T_ep in the third. There is a line for every cost
-    with a limit, or for the aggregate cost if there is none. Single epochs are drawn faint, their
-    moving mean strong. Where the table has multipliers, a fourth panel shows them.
+    with a limit, or for the aggregate cost without limits. Single epochs have faint lines, moving
+    means strong ones. If the table has multipliers, a fourth panel shows them.
 
     Args:
         table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
-        title: Written above the panels.
+        title: Title above the panels.
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
-    layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; it ends a pixel or two beside its aim
+    layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; the layout is a pixel or two inexact
     figure = NotebookFigure(figsize=(16 if multipliers else 12, 3.7), layout=layout)
     returns, costs, rates, *more = figure.subplots(1, 4 if multipliers else 3, sharex=True)
     steps = np.asarray(table["steps"], dtype=float)
@@ -134,7 +134,7 @@ def _draw(
     colour: str,
     label: str,
 ) -> None:
-    """Epochs in which an episode finished, faint, and their moving mean."""
+    """Draw the values of epochs in which an episode finished, and their moving mean."""
     known = np.isfinite(values)
     if not known.any():
         axes.text(0.5, 0.5, "no episode has ended", transform=axes.transAxes, ha="center")
@@ -147,7 +147,7 @@ def _draw(
 
 
 def point_marker(values: np.ndarray) -> str:
-    """Marker of a line through values, shape [n]: a single point would not be seen without.
+    """Marker of a line through values, shape [n]; without it a single point is invisible.
 
     Examples:
         >>> point_marker(np.zeros(1)), point_marker(np.zeros(2))

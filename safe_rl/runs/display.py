@@ -16,16 +16,16 @@ from safe_rl.runs.outcome import final_figures, final_rows, measured
 __all__ = ["LINE_SECONDS", "ProgressBar", "outcome_line", "shown"]
 
 LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
-"""Variable of runs that share a terminal: seconds between lines, which take the bar's place."""
+"""Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 
 _RATE_STEPS = 1000
 
 
 class ProgressBar:
-    """Steps done, steps per second, return and costs against their present limits.
+    """A bar with steps, steps per second, return, and costs with their present limits.
 
     Args:
-        directory: Folder of the run, whose name stands in its lines where it prints lines.
+        directory: Folder of the run; if lines replace the bar, they begin with its name.
         total: Environment steps of the whole run.
         begun: Steps that a continued run has made before.
         limits: Cost key -> d, undiscounted cost per episode.
@@ -51,7 +51,7 @@ class ProgressBar:
         self._limits, self._episode_length = limits, episode_length
 
     def add(self, row: Mapping[str, float]) -> None:
-        """Show an epoch, by columns of the table."""
+        """Show an epoch, given as its row of the table."""
         figures = shown(row, self._limits, self._episode_length)
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
@@ -63,7 +63,7 @@ class ProgressBar:
             print(f"{self._name}: {', '.join(words)}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Leave the bar as it is."""
+        """Close the bar; its last state stays on the terminal."""
         self._bar.close()
 
 
@@ -72,15 +72,16 @@ def shown(
     limits: Mapping[str, float],
     episode_length: int = _RATE_STEPS,
 ) -> dict[str, str]:
-    """Figures of an epoch for the bar: return, costs against their present limits, and λ.
+    """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
 
-    Means of the episodes that ended in the epoch; without one, return and costs of all steps so far
-    per 1,000 steps. While the limit comes down, "target" stands before its present value.
+    Return and costs are means over the episodes that ended in the epoch. If none ended, they are
+    those of all steps so far, per 1,000 steps. While an algorithm lowers its limit, the word
+    "target" precedes the present one.
 
     Args:
-        row: Of a run's table, by column.
+        row: Row of a run's table, by column.
         limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: Largest number of steps of an episode, by which a limit is a rate.
+        episode_length: Largest number of steps of an episode; it turns limits into rates.
 
     Examples:
         >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
@@ -113,7 +114,7 @@ def shown(
 def _present_limit(
     row: Mapping[str, float], key: str, limits: Mapping[str, float], scale: float
 ) -> str:
-    """The present limit of a cost, as the end of its figure."""
+    """The present limit of a cost, to follow its figure."""
     if key not in limits:
         return ""
     target, limit = row.get(f"target_{key}", -math.inf), limits[key]
@@ -127,7 +128,7 @@ def _present_limit(
 def outcome_line(
     table: Mapping[str, Sequence[float]], limits: Mapping[str, float], episode_length: int
 ) -> str:
-    """One line on how a run ended: return and costs over its last epochs.
+    """One line about the end of a run: return and costs over its last epochs.
 
     Args:
         table: Columns of the run's table.

@@ -1,6 +1,6 @@
 """The folder of a run: names of its files, and the lock that allows one writer.
 
-No other module spells these names.
+No other module contains these names.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ __all__ = [
 
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
 KINDS = ("last", "best", "certified")
-"""Folders of checkpoints: the newest few, the best that kept every limit, the certified one."""
+"""Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
 
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
@@ -76,26 +76,26 @@ class RunFolder:
     robot = _Below("robot")  # copies of the files of a user's own robot
     robot_note = _Below("robot.json")  # which robot that is, and its SHA-256
     notes = _Below(".hydra")  # Hydra's notes
-    overrides = _Below(".hydra/overrides.yaml")  # what the command line said
-    surroundings = _Below(".hydra/hydra.yaml")  # Hydra's settings, and the folder of the command
+    overrides = _Below(".hydra/overrides.yaml")  # overrides of the command line
+    surroundings = _Below(".hydra/hydra.yaml")  # Hydra's settings, and where the command was run
     composed = _Below(".hydra/config.yaml")  # the configuration before it was resolved
     code = _Below("code.json")  # versions of the code
     checkpoints = _Below("checkpoints")  # a folder for each of `KINDS`
-    transitions = _Below("transitions")  # what was collected, if it was recorded
+    transitions = _Below("transitions")  # collected transitions, if they were recorded
     certificate = _Below("certificate.json")  # which checkpoint is certified
     certifying = _Below(".certifying")  # exists between training and certificate
 
     def checkpoint(self, kind: str, steps: int) -> Path:
-        """The checkpoint of a kind after so many environment steps."""
+        """Path of the checkpoint of a kind with this number of environment steps."""
         return self.checkpoints / kind / checkpoint_name(steps)
 
     def newest_checkpoint(self, kind: str = "last") -> Path | None:
-        """The checkpoint after most steps, readable or not, if there is one of that kind."""
+        """The checkpoint of a kind with most steps, readable or not; None if there is none."""
         found = checkpoints_in(self.checkpoints / kind)
         return found[-1] if found else None
 
     def evaluation(self, name: str, suffix: str) -> Path:
-        """A file of an evaluation: ``json`` for estimates, ``csv``, ``mp4``, ``transitions``."""
+        """A file of an evaluation, by its suffix: ``json``, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
 
     def variations(self, name: str, suffix: str) -> Path:
@@ -103,7 +103,7 @@ class RunFolder:
         return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.{suffix}"
 
     def evaluations(self) -> list[Path]:
-        """The estimates of all evaluations."""
+        """The files with the estimates of all evaluations."""
         return sorted(self.directory.glob("evaluation*.json"))
 
     def logger_id(self, logger: str) -> Path:
@@ -133,7 +133,7 @@ class RunFolder:
         """Refuse a folder in which a run has begun.
 
         Raises:
-            FileExistsError: Saying how to continue that run.
+            FileExistsError: If there is one; the message says how to continue it.
         """
         if self.has_begun:
             raise FileExistsError(
@@ -150,7 +150,7 @@ class RunFolder:
         """Refuse a folder that is not a run's.
 
         Raises:
-            FileNotFoundError: Naming runs that are below it.
+            FileNotFoundError: If it is not; the message names runs below the folder.
         """
         if self.is_run:
             return
@@ -170,8 +170,8 @@ def runs_below(root: Path) -> list[RunFolder]:
 def paths_below(root: Path, pattern: str) -> list[Path]:
     """Files and folders below a folder whose names match, sorted.
 
-    Links to folders are not followed. Folders may vanish meanwhile, as those of a checkpoint that
-    is being written do, at which `Path.rglob` fails.
+    Links to folders are not followed. Folders may disappear during the search, which `Path.rglob`
+    does not tolerate.
     """
     return sorted(
         Path(folder, name)
@@ -182,12 +182,12 @@ def paths_below(root: Path, pattern: str) -> list[Path]:
 
 
 def checkpoint_name(steps: int) -> str:
-    """Name of a checkpoint after so many environment steps."""
+    """File name of a checkpoint with this number of environment steps."""
     return f"checkpoint-{steps:012d}.torchrl"
 
 
 def checkpoint_steps(path: Path) -> int | None:
-    """Environment steps that a checkpoint's name carries, if it is one's name.
+    """Environment steps in the name of a checkpoint; None if it is another file.
 
     Examples:
         >>> checkpoint_steps(Path("last/checkpoint-000000000300.torchrl"))
@@ -205,7 +205,7 @@ def checkpoints_in(directory: Path) -> list[Path]:
 
 
 def run_of(source: Path) -> tuple[Path, int | None]:
-    """Folder of the run in ``init_from``, and the steps of a checkpoint if it names one.
+    """Folder of the run that ``init_from`` names, and the steps if it names a checkpoint.
 
     Examples:
         >>> folder, steps = run_of(Path("a/checkpoints/best/checkpoint-000000003000.torchrl"))
@@ -243,13 +243,13 @@ class RunInUseError(ValueError):
 
 @contextmanager
 def lock_folder(folder: RunFolder) -> Iterator[None]:
-    """Keep other processes from writing into a folder; inside another such block, continue.
+    """Keep other processes from writing into a folder; such blocks may be nested.
 
-    This is a lock of the kernel (``flock``), which ends with its process. Where a file system has
-    no such locks, or each machine its own, nothing protects the folder from other machines.
+    The lock is the kernel's (``flock``), which ends with its process. If the file system has no
+    such locks, or each machine has its own, other machines are not kept from writing.
 
     Raises:
-        RunInUseError: If another process holds it.
+        RunInUseError: If another process holds the lock.
         ValueError: If the folder holds links, which could lead writing elsewhere.
 
     Examples:
@@ -260,8 +260,8 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
         True
     """
     check_no_links(folder.directory)
-    # One object per file, so that this process can lock it several times. Without the fallback: its
-    # file would stay when a process of another machine is killed, whose run could not be continued.
+    # One object per file, so that this process can lock it several times. No fallback to a file:
+    # after its process is killed, the file would stay, and the run could not be continued.
     place = folder.lock.resolve()
     lock = FileLock(place, 0, thread_local=False, is_singleton=True, fallback_to_soft=False)
     with ExitStack() as stack:

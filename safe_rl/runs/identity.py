@@ -1,7 +1,6 @@
 """Roles of a configuration's keys: which define the experiment, and which may change on resume.
 
-One table for everything that compares runs: ``resume=``, sweeps and the folders of their jobs, the
-report.
+All code that compares runs uses this table: ``resume=``, sweeps with their folders, reports.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ __all__ = [
 
 
 class Role(Enum):
-    """What a key is for.
+    """The purpose of a key.
 
     Attributes:
         names_experiment: Whether runs that differ in it are different experiments.
@@ -59,7 +58,7 @@ ROLES: dict[str, Role] = {
     "limits": Role.LEARNING,
     "limits.frames": Role.LENGTH,
     "loss": Role.LEARNING,
-    # what a checkpoint brings along: another value would have no effect, or not fit
+    # restored from checkpoints: another value would have no effect, or not fit
     "critic_update.optimizer": Role.EXPERIMENT,
     "policy_update.optimizer": Role.EXPERIMENT,
     "lagrangian.init": Role.EXPERIMENT,
@@ -67,14 +66,14 @@ ROLES: dict[str, Role] = {
     "lagrangian.derivative_delay": Role.EXPERIMENT,
     "loss.alpha_init": Role.EXPERIMENT,
     "*._target_": Role.EXPERIMENT,
-    "algo.constrained": Role.MANNER,  # told by the rest of the algorithm
+    "algo.constrained": Role.MANNER,  # it follows from the rest of the algorithm
     "collector": Role.MANNER,
     "collector.ray_init": Role.MACHINE,
     "default_cost_limits": Role.MANNER,
     "evaluation": Role.MANNER,
     "memory.keep": Role.MANNER,
     "note": Role.MANNER,
-    "certificate": Role.MACHINE,  # what is found out about a run, not what it is
+    "certificate": Role.MACHINE,  # about a finished run; training does not depend on it
     "checkpoint": Role.MACHINE,
     "compile": Role.MACHINE,
     "env.physics_buffers": Role.MACHINE,
@@ -83,17 +82,20 @@ ROLES: dict[str, Role] = {
     "import": Role.MACHINE,
     "logger": Role.MACHINE,
     "num_threads": Role.MACHINE,
-    "record": Role.MACHINE,  # what is kept of a run
+    "record": Role.MACHINE,  # which files of a run are kept
     "hydra": Role.MACHINE,
     "hydra.output_subdir": Role.MANNER,
     "hydra.run": Role.MANNER,
     "hydra.sweep": Role.MANNER,
 }
-"""Key, all below it, or ``*.`` and the last name of any key -> role; all others are EXPERIMENT."""
+"""Key -> its role and that of all keys below it; ``*.name`` is any key that ends in ``.name``.
 
-# keys that configurations of archived runs lack, and their values there
+All other keys are EXPERIMENT.
+"""
+
+# keys that configurations of archived runs lack -> the values that these runs had
 _ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
-# likewise: with these values they are left out of comparisons
+# likewise; keys with these values are left out of comparisons
 _SILENT: dict[str, Hashable] = {
     "env.outside": None,
     "env.physics": "cpu",
@@ -113,7 +115,7 @@ _SILENT: dict[str, Hashable] = {
 
 
 def role_of(key: str) -> Role:
-    """The role of a dotted key: that of the nearest row above it.
+    """The role of a dotted key: that of its own row, or of the nearest key above it with a row.
 
     Examples:
         >>> role_of("policy_update.max_kl").name, role_of("policy_update.optimizer.lr").name
@@ -124,15 +126,15 @@ def role_of(key: str) -> Role:
     names = key.split(".")
     above = [".".join(names[:depth]) for depth in range(len(names), 0, -1)]
     role = next((ROLES[row] for row in above if row in ROLES), Role.EXPERIMENT)
-    # the target of a group has the role of the group unless that defines the experiment
+    # a row ``*.name`` holds only below keys that define the experiment
     return ROLES.get(f"*.{names[-1]}", role) if role.names_experiment and names[1:] else role
 
 
 def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
     """Dotted key -> value of all keys that define a run's experiment.
 
-    Runs with equal results differ only in the seed, and in where and how they were carried out.
-    ``init_from`` is the common part of the sources of all seeds, see
+    Runs for which these are equal differ only in the seed, and in where and how they were run.
+    ``init_from`` is reduced to the part that all seeds share, see
     :func:`safe_rl.runs.folder.common_source`.
 
     Args:
@@ -150,7 +152,7 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
 
 
 def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted key -> the two values where configurations differ and a sweep's job may not.
+    """Dotted key -> two values, of keys that differ although a sweep's job may not change them.
 
     Examples:
         >>> differences({"seed": 0, "frames": 10}, {"seed": 1, "frames": 20})
@@ -199,12 +201,12 @@ def _hashable(value: Any) -> Hashable:
 
 
 def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
-    """Environment, algorithm and seed of a run, and what a person set on its command line.
+    """Environment, algorithm and seed of a run, and the settings of its command line.
 
     Keys that belong to the machine are left out. Lists and mappings are written as texts.
 
     Args:
-        directory: Folder of the run, with Hydra's notes; without them nothing else was set.
+        directory: Folder of the run; without Hydra's notes in it there are no other settings.
         config: Configuration of the run.
     """
     notes = RunFolder(directory).overrides
@@ -221,7 +223,7 @@ def check_same_run(directory: Path, config: DictConfig) -> None:
     """Refuse to continue a run with other settings; length and machine may differ.
 
     Raises:
-        ValueError: Naming every key that differs.
+        ValueError: If other settings differ; the message names every key.
     """
     run = RunFolder(directory)
     if not run.is_run:

@@ -1,7 +1,7 @@
 """Loggers that continue an interrupted run.
 
-Each is TorchRL's, keeps its files or the id of its run in the folder ``log_dir``, and is chosen by
-``logger=`` from ``conf/logger``.
+Each is derived from TorchRL's, keeps its files or the id of its run in the folder ``log_dir``, and
+is chosen by ``logger=`` from ``conf/logger``.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ __all__ = ["MLflowLogger", "ResumableLogger", "TensorboardLogger", "WandbLogger"
 
 
 class ResumableLogger:
-    """What a run calls besides ``log_scalar``: a base class of loggers, after TorchRL's."""
+    """Methods that a run calls besides ``log_scalar``: a second base class of loggers."""
 
     def continue_from(self, step: int) -> None:
-        """Discard what was logged after a step; nothing to do where logging it again does that."""
+        """Discard what was logged after a step, unless logging it again replaces it."""
 
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Log the settings that the user has given, by name."""
@@ -46,7 +46,7 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
         log_dir: Folder of the run.
 
     Raises:
-        ValueError: If ``exp_name`` leads elsewhere.
+        ValueError: If ``exp_name`` is no name of a folder.
 
     Examples:
         >>> import tempfile
@@ -70,8 +70,8 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Write the settings by which TensorBoard's page HParams compares runs.
 
-        ``SummaryWriter.add_hparams`` would make a folder below, and a list of columns of which
-        TensorBoard takes only that of the first run. Without such a list it has those of all runs.
+        ``SummaryWriter.add_hparams`` would make another folder, and a list of columns; TensorBoard
+        then shows the columns of the first run only. Without a list it shows those of all runs.
 
         Args:
             cfg: Name -> number, text or boolean.
@@ -85,7 +85,7 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
 
 @needs_extra("mlflow", "mlflow")
 class MLflowLogger(MLFlowLogger, ResumableLogger):
-    """A run of an MLflow experiment; a continued run uses the same one.
+    """A run of an MLflow experiment; a continued run uses the same MLflow run.
 
     Metrics that are logged again after an interruption have the same values as before.
 
@@ -121,7 +121,7 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
 
 @needs_extra("wandb", "wandb")
 class WandbLogger(TorchRLWandbLogger, ResumableLogger):
-    """A run of Weights & Biases; a continued run uses the same one.
+    """A run of Weights & Biases; a continued run uses the same W&B run.
 
     Args:
         exp_name: Name of the run.

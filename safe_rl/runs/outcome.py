@@ -1,6 +1,6 @@
 """Final figures of a run, and its violations of limits.
 
-Used by the best checkpoint, the terminal, the curves and the report.
+The best checkpoints, the terminal, the curves and the report use them.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
 
 FINAL_STEPS = 100_000
-"""Steps to cover at least: five epochs of SAC are 25 episodes, five of PPO a hundred."""
+"""Steps to average over at least: five epochs of SAC have 25 episodes, five of PPO a hundred."""
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
     """Amount by which a limit is exceeded; negative within it.
 
-    That is J_c − d, or the column ``violation_<key>`` where there is one: an algorithm that limits
-    something else than the mean cost of an episode writes its own violation there.
+    This is J_c − d, or the column ``violation_<key>`` if there is one: an algorithm that limits
+    another measure than the mean cost of an episode writes its own violation there.
 
     Args:
         row: Of a run's table, or its final figures, by column.
@@ -53,7 +53,7 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
 
 
 def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
-    """What is compared with a limit; the mean episode cost where there is none.
+    """The measure that is compared with a limit; without a limit, the mean episode cost.
 
     Examples:
         >>> measured({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
@@ -63,10 +63,11 @@ def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
 
 
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
-    """Whether an epoch keeps a limit, by its episodes and by what the algorithm estimates.
+    """Whether an epoch keeps a limit, by its episodes and by the algorithm's own estimate.
 
-    The few episodes of one epoch may keep a limit by chance. An algorithm that tracks J_c has the
-    columns ``estimate_<key>`` and ``target_<key>``; then its estimate has to be at its target.
+    The few episodes of one epoch may keep a limit by chance. An algorithm that tracks J_c writes
+    the columns ``estimate_<key>`` and ``target_<key>``. Then its estimate may not exceed its target
+    either.
 
     Args:
         row: Of a run's table, by column.
@@ -103,7 +104,7 @@ def mean_row(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
 def feasible_return(
     latest: Sequence[Mapping[str, float]], limits: Mapping[str, float]
 ) -> float | None:
-    """Mean return of a run's latest epochs, if by their means every limit is kept, else None.
+    """Mean return of a run's latest epochs if their means keep every limit, else None.
 
     Args:
         latest: The epochs' rows, at least one.
@@ -122,7 +123,7 @@ def feasible_return(
 
 
 def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:
-    """Whether the limit of a cost is on something else than the mean cost of an episode.
+    """Whether the limit of a cost is on another measure than the mean cost of an episode.
 
     Args:
         table: Columns of a run's table.
@@ -145,10 +146,10 @@ def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit
 
 
 def final_width(steps: Iterable[float]) -> int:
-    """Over how many epochs final figures, and the moving means of curves, are taken.
+    """Number of epochs over which final figures, and the moving means of curves, are taken.
 
-    At least ``FINAL_EPOCHS``, and enough to cover ``FINAL_STEPS`` or, if that is less, a fifth of
-    the run.
+    At least ``FINAL_EPOCHS``, and enough to cover ``FINAL_STEPS`` or a fifth of the run, whichever
+    is less.
 
     Args:
         steps: Steps at the end of every epoch in which an episode finished.
@@ -174,8 +175,8 @@ def final_figures(
 ) -> dict[str, float]:
     """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
 
-    J_r, J_c and violations of limits are means over the last epochs in which an episode finished,
-    as many as :func:`final_width` says; ρ_c is that of the last epoch.
+    J_r, J_c and violations of limits are means over the last :func:`final_width` epochs in which an
+    episode finished; ρ_c is that of the last epoch.
 
     Args:
         table: Columns of the run's table.

@@ -1,4 +1,4 @@
-"""What a run writes into its folder and shows on the terminal."""
+"""The files that a run writes while it trains, and its output on the terminal."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ __all__ = ["RunRecord", "code_of", "commit_of", "note_code"]
 class RunRecord:
     """Configuration, table, logger, learning curves and progress bar of one run.
 
-    The folder holds ``config.yaml`` (resolved), ``code.json`` (the commits that it ran with),
-    ``progress.csv`` (a row per epoch), ``curves.png`` and what the configured logger writes.
+    The folder holds ``config.yaml`` (resolved), ``code.json`` (the commits that the run used),
+    ``progress.csv`` (a row per epoch), ``curves.png`` and the files of the configured logger.
 
     Args:
         directory: The folder; made if it does not exist.
@@ -58,7 +58,7 @@ class RunRecord:
         cost_limits: Mapping[str, float],
         episode_length: int,
     ) -> None:
-        # imported now, so that a wrong MPLBACKEND is an error before the run begins
+        # imported here, so that a wrong MPLBACKEND is an error before the run begins
         import matplotlib  # noqa: F401
 
         self.directory = directory
@@ -76,18 +76,18 @@ class RunRecord:
             steps: Environment steps that it has made before.
 
         Raises:
-            FileExistsError: If a new run would overwrite one that is there.
-            RunInUseError: If another process writes there.
-            ValueError: If the table lacks epochs of the run that is to be continued.
+            FileExistsError: If the folder of a new run already holds one.
+            RunInUseError: If another process writes into the folder.
+            ValueError: If the table lacks epochs of the continued run.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         with lock_folder(self.folder):
             if epoch is None:
                 self.folder.check_is_free()
             self._steps_before = steps
-            # of a continued run: replaced after the first epoch, before which wrong settings fail
+            # a continued run replaces it after its first epoch: wrong settings fail before
             self._is_config_saved = False
-            # before the table: a table without a configuration could not be continued
+            # written before the table: a run without a configuration cannot be continued
             if epoch is None or not self.folder.is_run:
                 self._save_config()
             self._table = TableWriter(self.folder.table, keep_rows=epoch or 0)
@@ -121,7 +121,7 @@ class RunRecord:
             self._is_config_saved = True
 
     def _log_final(self) -> None:
-        """Write the final figures to the logger, by which it compares runs."""
+        """Write the final figures to the logger, which compares runs by them."""
         if self._logger is None or not self.folder.num_rows:
             return
         table = read_table(self.folder.table)
@@ -133,7 +133,7 @@ class RunRecord:
                 )
 
     def add(self, row: Mapping[str, float]) -> None:
-        """Write one epoch to table and logger and show it."""
+        """Write an epoch to the table and the logger, and show it."""
         self._save_config()
         self._table.write(row)
         if self._logger is not None:
@@ -143,7 +143,7 @@ class RunRecord:
         self._bar.add(row)
 
     def rows(self) -> list[dict[str, float]]:
-        """Return the epochs that are in the table, by column."""
+        """The rows of the table, each by column."""
         table = read_table(self.folder.table) if self.folder.num_rows else {}
         return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
@@ -161,14 +161,14 @@ class RunRecord:
         )
 
     def summary(self) -> str:
-        """One line on how the run ended."""
+        """One line about the end of the run."""
         table = read_table(self.folder.table)
         line = outcome_line(table, self._cost_limits, self._episode_length)
         return f"{line}; {self.directory}"
 
 
 def note_code(path: Path, steps: int) -> None:
-    """Add the code that continues a run to the file that lists its versions.
+    """Add the present version of the code to the file that lists the versions of a run.
 
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
@@ -184,9 +184,9 @@ def note_code(path: Path, steps: int) -> None:
 
 @cache
 def code_of() -> Mapping[str, Any]:
-    """What this process has imported: ``version``, ``commit`` and ``changed``.
+    """The code of this process: ``version``, ``commit`` and ``changed``.
 
-    The last two are None if the package stands in no checkout, or Git is missing.
+    The last two are None if the package is not in a checkout, or Git is missing.
 
     Examples:
         >>> sorted(code_of())
@@ -200,8 +200,8 @@ def code_of() -> Mapping[str, Any]:
 def commit_of(file: Path) -> tuple[str | None, bool | None]:
     """The commit of the checkout that a file belongs to, and whether it has been changed since.
 
-    Both are None if Git does not track the file: an installed package may lie in another project's
-    checkout.
+    Both are None if Git does not track the file: an installed package may be inside the checkout of
+    another project.
 
     Examples:
         >>> commit_of(Path("/nowhere/module.py"))
@@ -217,8 +217,8 @@ def commit_of(file: Path) -> tuple[str | None, bool | None]:
 
 
 def _git(directory: Path, *arguments: str) -> str:
-    """The answer of Git without its newline; empty if there is none."""
-    # without locks, which would be in the way of what the user does with Git meanwhile
+    """The output of Git without its newline; empty if the command fails."""
+    # without locks, which could make the user's own Git commands fail
     command = ["git", "--no-optional-locks", *arguments]
     try:
         result = subprocess.run(

@@ -11,12 +11,12 @@ from safe_rl.files import read_bounded, replace_text
 
 __all__ = ["TableError", "TableWriter", "read_table"]
 
-# Of a table; ten thousand epochs with a hundred columns have about 20 million
+# largest size of a table [bytes]; ten thousand epochs with a hundred columns have about 20 million
 _MOST_BYTES = 100_000_000
 
 
 class TableError(ValueError):
-    """A table is not as its run has written it."""
+    """A table that is not as its run has written it."""
 
 
 class TableWriter:
@@ -27,12 +27,11 @@ class TableWriter:
 
     Args:
         path: File to write. An existing one is replaced.
-        keep_rows: Number of rows of an existing file to keep, for a run that continues; 0 starts
-            afresh.
+        keep_rows: Number of rows of an existing file to keep, for a run that continues.
 
     Raises:
-        TableError: If there are fewer rows than are to be kept, or one cannot be read; by
-            :meth:`write`, if a row's columns differ from the first one's.
+        TableError: If there are fewer rows than are to be kept, or one cannot be read; from
+            :meth:`write`, if a row's columns differ from those of the first row.
 
     Examples:
         >>> import tempfile
@@ -63,8 +62,7 @@ class TableWriter:
             raise TableError(
                 f"Every row of progress.csv must have the columns of the first, in the same order; "
                 f"these are in one of the two only: {unexpected}. If the file has been changed, "
-                "put it back; a diagnostic is reported in every epoch, as NaN where it does not "
-                "exist."
+                "restore it; report a diagnostic in every epoch, as NaN where it does not exist."
             )
         self._append([_field(value) for value in row.values()])
 
@@ -84,19 +82,19 @@ class TableWriter:
 
 
 def _first_rows(path: Path, number: int) -> list[str]:
-    """Lines of a table: the header and as many rows."""
+    """Lines of a table: the header and the first ``number`` rows."""
     complete = _complete_lines(path) if path.exists() else []
     if len(complete) < number + 1:
         raise TableError(
             f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
             f"continued has finished {number} epochs: the table has been changed or cut off. "
-            "Put it back to continue, or begin a new run from the networks with init_from=."
+            "Restore it to continue, or begin a new run from the networks with init_from=."
         )
     return complete[: number + 1]
 
 
 def _complete_lines(path: Path) -> list[str]:
-    """Lines of a table; the last one has no end yet while it is written."""
+    """Lines of a table without the last one if its end is still missing."""
     try:
         lines = read_bounded(path, _MOST_BYTES).decode().splitlines(keepends=True)
     except UnicodeDecodeError:
@@ -114,20 +112,20 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
     """Numbers of a table by columns.
 
     Raises:
-        TableError: If a row has more or fewer fields than the header, or one that is no number.
+        TableError: If a row has more or fewer fields than the header, or a field is no number.
     """
     names, *rows = csv.reader(lines) if lines else [[]]
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise TableError(
                 f"{path}, line {number} has {len(row)} fields and the header {len(names)}: the "
-                "table has been changed. Put it back."
+                "table has been changed. Restore it."
             )
     try:
         columns = zip(*rows, strict=True) if rows else ([] for _ in names)
         return {name: list(map(_number, c)) for name, c in zip(names, columns, strict=True)}
     except ValueError as error:
-        raise TableError(f"{path} holds what is no number: {error}.") from None
+        raise TableError(f"{path} has a field that is no number: {error}.") from None
 
 
 def _number(field: str) -> float:
@@ -137,11 +135,11 @@ def _number(field: str) -> float:
 def read_table(path: Path) -> dict[str, list[float]]:
     """Read a table by columns; empty fields are NaN.
 
-    A last line without its end, as a run that was killed leaves it, is no row.
+    A last line without its end, which a killed run may leave, is not read.
 
     Raises:
-        ValueError: If the file has no header, or holds more than any table of a run; as
-            `TableError`, if it has been changed.
+        TableError: If the file has been changed.
+        ValueError: If the file is empty, or larger than any table of a run.
     """
     lines = _complete_lines(path)
     if not lines:

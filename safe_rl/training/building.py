@@ -1,6 +1,6 @@
 """Build a run from a configuration and an environment.
 
-A run can start from the networks of another one (Ray, Achiam, Amodei 2019, section 6).
+A run can start from the networks of another run (Ray, Achiam, Amodei 2019, section 6).
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ __all__ = [
 ]
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
-"""Makes an evaluation of a policy that is still learning."""
+"""Makes the periodic evaluation of a policy that is trained."""
 
 
 def physics_threads(config: DictConfig) -> int:
-    """Threads that step each environment; 0 is one per core. Workers share them."""
+    """Threads of the physics of each collector; 0 is one per core. Workers divide them."""
     num_collectors = config.collector.num_collectors
     if num_collectors == 1:
         return config.num_threads or 0
@@ -61,16 +61,17 @@ def build_trainer(
     make_env: MakeEnv | None = None,
     make_evaluation: MakeEvaluation | None = None,
 ) -> Trainer:
-    """Build everything that a run consists of.
+    """Build all parts of a run.
 
     Args:
         config: Configuration as composed from ``conf/``.
-        env: Seeded environment that fulfils the contract of `safe_rl.envs`; if it has ``get_state``
-            and ``set_state``, checkpoints have the state of its worlds.
+        env: Seeded environment that fulfils the contract of `safe_rl.envs`. If its ``get_state``
+            returns a state, checkpoints have it.
         directory: Folder of the run.
-        make_env: Makes an environment like ``env`` with another ``num_envs``, for collectors with
-            workers.
-        make_evaluation: Makes the periodic evaluation of the policy.
+        make_env: Function that makes an environment like ``env`` with another ``num_envs``, for
+            collectors with workers.
+        make_evaluation: Function that makes the periodic evaluation of the policy; None: no
+            evaluation.
 
     Raises:
         ValueError: If parts of the configuration do not fit together.
@@ -102,7 +103,7 @@ def _build_collector(
 
 
 def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
-    """Rows of time of all environments together in a batch, ``frames_per_batch`` being steps."""
+    """Decisions of all environments together in a batch; ``frames_per_batch`` counts steps."""
     frames, together = config.frames_per_batch, env.batch_size.numel() * env.steps_per_decision
     if env.steps_per_decision != 1 and frames % together:
         below = frames // together * together
@@ -115,7 +116,7 @@ def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
 
 
 def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
-    """Give an algorithm the networks of ``init_from``; see `initialise_networks`."""
+    """Load the networks of ``init_from`` into an algorithm; see `initialise_networks`."""
     taken = initialise_networks(
         algorithm.networks,
         Path(config["init_from"]),
@@ -134,20 +135,20 @@ def initialise_networks(
     cost_loss: str | None = None,
     cost_networks: Collection[str] = ("cost_critic",),
 ) -> list[str]:
-    """Give networks the trained weights of another run.
+    """Load the trained weights of another run into networks.
 
     Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
     if that run had the same constrained costs and, with Q functions, the same loss.
 
     Args:
-        networks: The new run's by name, changed in place.
-        source: Folder of the run, of which the newest checkpoint is read, or a checkpoint.
+        networks: Networks of the new run by name, changed in place.
+        source: Folder of the other run, whose newest checkpoint is read, or a checkpoint.
         cost_keys: Keys of the new run's constrained costs.
         cost_loss: Loss of the new run's cost critics if they are Q functions.
         cost_networks: Names of the networks of costs.
 
     Returns:
-        Names of the networks that were taken over.
+        Names of the networks that were loaded.
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
@@ -165,8 +166,8 @@ def initialise_networks(
     weights = read_states(checkpoint)
     if absent := [name for name in taken if name not in weights]:
         raise CheckpointError(
-            f"{checkpoint} has no {' and no '.join(absent)}, which this run begins with, too: "
-            "init_from needs a run whose algorithm has learned all of them, as algo=bc does not."
+            f"{checkpoint} has no {' and no '.join(absent)}, which this run needs: init_from takes "
+            "a run whose algorithm has trained all networks of this one, unlike algo=bc."
         )
     for name, network in taken.items():
         _check_shapes(name, network.state_dict(), weights[name], checkpoint)
@@ -186,7 +187,7 @@ def _newest(directory: Path) -> Path:
 
 
 def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
-    """Costs of the cost critic in a checkpoint, empty if not known; and its loss."""
+    """Cost keys of the cost critic in a checkpoint, empty if unknown, and its loss."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
     is_constrained = (config.get("algo") or {}).get("constrained", False)
@@ -195,7 +196,7 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
 
 
 def _cost_loss(config: Mapping[str, Any]) -> str | None:
-    """Loss of Q functions: equal networks may give a mean in one and a variance in another."""
+    """Loss of Q functions, which decides what they estimate, such as a mean or a variance."""
     return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
 
 

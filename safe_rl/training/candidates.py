@@ -14,7 +14,7 @@ from safe_rl.runs.outcome import feasible_return
 
 __all__ = ["Candidates", "Judged", "epochs_until_judged"]
 
-# upper bound of epochs to wait: waiting policies are in main memory and in every checkpoint
+# most epochs to wait: waiting policies are in main memory and in every checkpoint
 _LONGEST = 10
 
 

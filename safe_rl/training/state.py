@@ -1,4 +1,4 @@
-"""State of the training loop: counters, saved worlds between epochs, a request to stop."""
+"""State of the training loop: counters, the environment's state, a request to stop."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Progress(Resumable):
 
 
 class WorldSnapshot:
-    """The state of the worlds at the start of the next epoch, and the observation there.
+    """The state of the environment, and its observation, at the start of the next epoch.
 
     Every epoch restores a snapshot, also in a run that is not resumed. The reason: restoring a
     state changes things that snapshots do not have (it wakes sleeping bodies). If only resumed runs
@@ -66,11 +66,13 @@ class WorldSnapshot:
         self._go_on_from(self._env.get_state())
 
     def stagger(self, max_steps: int, multiple: int = 1) -> bool:
-        """Start row i of N at step i · max_steps / N of its first episode, so not all end at once.
+        """Start instance i of N at step i · max_steps / N of its first episode.
+
+        Then the episodes of different instances end at different times.
 
         Args:
             max_steps: Steps of an episode.
-            multiple: Environment steps per decision; all rows start at a multiple of it.
+            multiple: Environment steps per decision; all instances start at a multiple of it.
 
         Returns:
             Whether this was possible: the environment's state must have a ``step_count``.
@@ -90,7 +92,7 @@ class WorldSnapshot:
         return self._snapshot.to_dict()
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the worlds, and let the collector continue from them."""
+        """Restore the environment, and let the collector continue from it."""
         self._go_on_from(self._snapshot.from_dict(state_dict, batch_size=self._env.batch_size))
 
     def _go_on_from(self, snapshot: TensorDictBase) -> None:
@@ -122,7 +124,7 @@ class StopRequest:
 
     def __enter__(self) -> StopRequest:
         if threading.current_thread() is threading.main_thread():
-            # a background job of a shell ignores SIGINT too, but must react to one that is sent
+            # SIGINT is caught even if ignored, as in a shell's background job: kill -INT must work
             ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
             caught = self._SIGNALS - {signal.SIGHUP} if ignores_hangup else self._SIGNALS
             self._previous = {number: signal.signal(number, self._stop) for number in caught}
@@ -134,7 +136,7 @@ class StopRequest:
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.received = signal.Signals(number)
         self._restore()
-        # not by print(), which the signal may have interrupted; the terminal may be gone
+        # not print(): the signal may have interrupted one; the terminal may be closed
         with suppress(OSError):
             os.write(2, b"\nStopping after this epoch. Once more stops at once.\n")
 

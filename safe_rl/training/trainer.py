@@ -37,21 +37,21 @@ _FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting"
 
 
 Evaluator = Callable[[int, int], dict[str, float]]
-"""A periodic evaluation: steps before and after an epoch -> columns, the same at every call."""
+"""A periodic evaluation: steps before and after an epoch -> columns, the same ones at each call."""
 
 
 class Trainer:
-    """One run.
+    """The training loop of one run.
 
     Args:
         env: Environment that the collector steps.
         algorithm: The algorithm to train.
-        collector: Endless collector of [N, T] batches, running the algorithm's policy.
+        collector: Endless collector of [N, T] batches with the algorithm's policy.
         cost_limits: Cost key -> d, undiscounted cost per episode, for the best checkpoints.
         record: Writes the files of the run.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
-        evaluation: Evaluates the policy after every epoch in which that is due, or None.
-        recording: Where every batch is written, or None.
+        evaluation: Periodic evaluation of the policy, called after every epoch, or None.
+        recording: Writes every batch to disk, or None.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Trainer:
         self._collector = collector
         self._env = env
         self._evaluation, self._recording = evaluation, recording
-        # the worlds of workers are out of reach
+        # the environments of workers are in other processes
         self._worlds = None
         if isinstance(collector, Collector) and env.get_state() is not None:
             self._worlds = WorldSnapshot(env, collector)
@@ -121,7 +121,7 @@ class Trainer:
         )
 
     def components(self) -> dict[str, Stateful]:
-        """Parts of a checkpoint, by name."""
+        """The parts of a checkpoint by name."""
         return {**self._parts(), "candidates": self._candidates}
 
     def _parts(self) -> dict[str, Stateful]:
@@ -136,10 +136,10 @@ class Trainer:
         return parts
 
     def resume(self) -> bool:
-        """Continue the run in the folder from its newest checkpoint, or from the beginning if none.
+        """Continue the run in the folder from its newest checkpoint, if there is one.
 
         Returns:
-            Whether there was one.
+            Whether there was a checkpoint.
 
         Raises:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
@@ -147,17 +147,17 @@ class Trainer:
         self._is_continued = True
         with lock_folder(self.record.folder):
             restored = self._checkpoints.resume(self.record.folder.num_rows)
-        if restored is not None:  # a run that starts over keeps its first episodes
+        if restored is not None:  # a run that starts over has begun its episodes already
             self._begin_episodes()
         return restored is not None
 
     @property
     def begins_anew(self) -> bool:
-        """Whether a resumed run begins new episodes, because worlds have no stored state."""
+        """Whether a resumed run begins new episodes, because checkpoints have no environments."""
         return self._worlds is None
 
     def _begin_episodes(self) -> None:
-        """Begin new episodes, because the state of the worlds was not saved."""
+        """Begin new episodes if the state of the environments was not saved."""
         if self._worlds is not None:
             return
         self.accounting.forget_open_episodes()
@@ -165,8 +165,8 @@ class Trainer:
             self._recording.cut_after(self.progress.epoch - 1)
         self.algorithm.forget_open_episodes()
         self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
-        # with the old seed the first episodes of the run would come again; workers, which have not
-        # started yet, continue from the state of this environment
+        # with the old seed the first episodes of the run would be repeated; workers start later,
+        # from the state of this environment
         self._env.set_seed(int(torch.randint(2**31, ())))
         if isinstance(self._collector, Collector):
             self._collector.reset()
@@ -178,7 +178,7 @@ class Trainer:
         ``interrupted_by`` is the signal, unless that epoch was the last one.
 
         Returns:
-            One line on the outcome.
+            One line about the outcome.
         """
         try:
             self._train()
@@ -190,7 +190,7 @@ class Trainer:
         return self.record.summary()
 
     def close(self) -> None:
-        """Close the collector with its workers, if any, and the environment, at any moment."""
+        """Close the collector with its workers, if any, and the environment."""
         if isinstance(self._collector, WorkerCollector):
             self._collector.kill()
         else:
@@ -206,10 +206,10 @@ class Trainer:
             if not self.progress.epoch:
                 self._checkpoints.begin()
             if self._recording is not None:
-                # batches after the checkpoint are removed, like rows of the table
+                # batches after the checkpoint are removed, as rows of the table are
                 self._recording.begin(self.progress.epoch)
             self._candidates.continue_after(self.record.rows())
-            # at its end, the shorter run judged these by fewer epochs
+            # if the run was shorter before, these were judged by fewer epochs at its end
             self._checkpoints.forget_best(one["steps"] for one in self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
@@ -218,7 +218,7 @@ class Trainer:
                 answers = [callback(row) for callback in self.callbacks]
                 if any(answer is False for answer in answers):
                     break
-                if stop.received:  # not before the first: a run has an epoch to show
+                if stop.received:  # checked after an epoch: every run has at least one
                     break
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
@@ -226,7 +226,7 @@ class Trainer:
             if self.progress.steps < self._frames and stop.received:
                 self.interrupted_by = stop.received
             else:
-                # before the last checkpoint, which marks the run as finished
+                # before the last checkpoint is written, which marks the run as finished
                 self._keep(self._candidates.judge_all())
             self._save()
 
@@ -235,10 +235,10 @@ class Trainer:
         return iter(self._collector)
 
     def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
-        """Collect one batch and learn from it; returns the row of the table."""
+        """Collect one batch and learn from it; return the row of the table."""
         start = time.perf_counter()
-        # One observation per environment is too little work to share among threads, and the
-        # physics wants the cores.
+        # One observation per environment is too little work for several threads, and the physics
+        # needs the cores.
         with torch_threads(1):
             batch = next(batches)
             if self._worlds is not None:
@@ -275,6 +275,6 @@ class Trainer:
         self.record.draw_curves()
 
     def _keep(self, judged: Iterable[Judged]) -> None:
-        """Save checkpoints of those policies that are among the best so far."""
+        """Save checkpoints of the judged policies that are among the best so far."""
         for one in judged:
             self._checkpoints.save_best(one.steps, one.score, one.facts, states=one.states)

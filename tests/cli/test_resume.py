@@ -138,7 +138,7 @@ def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
         "_target_: safe_rl.collectors.make_ray_collector\n  num_collectors",
     )
     path.write_text(local.replace("null}", "far}"))
-    with pytest.raises(CommandLineError, match=r"say again collector\.ray_init\.address="):
+    with pytest.raises(CommandLineError, match=r"again, collector\.ray_init\.address="):
         compose_resumed(run, [])
     actors = "null}\n  resources: {runtime_env: {pip: [theirs]}}"
     for started in ("null, runtime_env: {pip: [theirs]}}", actors):

@@ -71,7 +71,7 @@ def test_a_row_that_is_cut_off_is_no_row(tmp_path):
         (lambda b: b.replace(b"steps", b"stepz", 1), "have the columns of the first"),
         (lambda b: b.replace(b"\n", b"\n\n", 1), "line 2 has 0 fields and the header"),
         (lambda b: b"\x80\x81" + b, "is no table: it is not text"),
-        (lambda b: b.replace(b"\n1,", b"\none,", 1), "holds what is no number"),
+        (lambda b: b.replace(b"\n1,", b"\none,", 1), "has a field that is no number"),
     ],
 )
 def test_a_table_that_was_changed_is_told_in_a_line(change, message, tmp_path):
