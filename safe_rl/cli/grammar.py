@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -25,8 +25,8 @@ from omegaconf.errors import OmegaConfBaseException
 from safe_rl.naming import did_you_mean
 
 __all__ = [
-    *("IMPORT", "CommandLineError", "overrides_of", "parse", "parse_options", "quote"),
-    *("run_command", "say_interruptions", "split_imports", "take_options", "take_word", "usage"),
+    *("IMPORT", "CommandLineError", "overrides_of", "parse", "parse_options", "run_command"),
+    *("say_interruptions", "split_imports", "take_options", "take_word", "usage"),
 ]
 
 if TYPE_CHECKING:
@@ -77,16 +77,6 @@ def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
     others = [word for word in words if word not in given]
     return [word.partition("=")[2] for word in given], others
 
-
-def quote(text: str) -> str:
-    r"""Quote a text so that the grammar reads it unchanged.
-
-    Examples:
-        >>> print(quote(r"it's a\b"))
-        'it\'s a\b'
-    """
-    # backslashes are doubled before a quote only
-    return "'" + re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), text) + "'"
 
 
 def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
@@ -150,7 +140,7 @@ def _written(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ",".join(map(_written, value)) + "]"
     if isinstance(value, str | Path):
-        return quote(str(value))
+        return QuotedString(str(value), Quote.single).with_quotes()
     # JSON does not know numbers and arrays of NumPy and torch
     return _written(value.tolist()) if hasattr(value, "tolist") else json.dumps(value)
 
