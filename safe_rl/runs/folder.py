@@ -129,17 +129,6 @@ class RunFolder:
             return 0
         return max(0, lines - 1)
 
-    def check_is_free(self) -> None:
-        """Refuse a folder in which a run has begun.
-
-        Raises:
-            FileExistsError: If there is one; the message says how to continue it.
-        """
-        if self.has_begun:
-            raise FileExistsError(
-                f"{self.directory} already holds a run. Continue it with: python train.py "
-                f"{self.resuming}; or give this one another folder with hydra.run.dir=..."
-            )
 
     @property
     def resuming(self) -> str:

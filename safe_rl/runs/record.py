@@ -82,8 +82,8 @@ class RunRecord:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         with lock_folder(self.folder):
-            if epoch is None:
-                self.folder.check_is_free()
+            if epoch is None and self.folder.has_begun:
+                raise FileExistsError(f"{self.directory} already holds a run.")
             self._steps_before = steps
             # a continued run replaces it after its first epoch: wrong settings fail before
             self._is_config_saved = False
