@@ -59,18 +59,6 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
     return content
 
 
-def _restore(path: Path, components: Mapping[str, Stateful]) -> None:
-    """Restore parts from a checkpoint; all states are read before the first part is changed."""
-    states = read_states(path, components)
-    for name in sorted(states):
-        try:
-            components[name].load_state_dict(states[name])
-        except Exception as error:  # a part of unknown origin can be wrong in any way
-            words = " ".join(str(error).split())
-            raise CheckpointError(
-                f"Cannot use the checkpoint {path}: its {name!r} does not fit: {words}"
-            ) from error
-
 
 def best_checkpoint(directory: Path) -> Path | None:
     """The checkpoint with the highest score in a folder, the newest among equal ones.
@@ -280,7 +268,15 @@ class CheckpointStore:
                     f"The checkpoint {path} is another run's: its {key} is {known[key]}, this "
                     f"run's is {expected}. For a new run from its networks use init_from=."
                 )
-        _restore(path, components)
+        states = read_states(path, components)
+        for name in sorted(states):
+            try:
+                components[name].load_state_dict(states[name])
+            except Exception as error:  # a part of unknown origin can be wrong in any way
+                words = " ".join(str(error).split())
+                raise CheckpointError(
+                    f"Cannot use the checkpoint {path}: its {name!r} does not fit: {words}"
+                ) from error
 
 
 def is_finished(directory: Path, frames: int) -> bool:

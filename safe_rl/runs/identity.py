@@ -5,7 +5,7 @@ All code that compares runs uses this table: ``resume=``, sweeps with their fold
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -183,15 +183,13 @@ def flatten(settings: Mapping[str, Any]) -> dict[str, Hashable]:
         >>> flatten({"model": {"hidden_sizes": [64, 64], "input_scale": {}}, "seed": 1})
         {'model.hidden_sizes': (64, 64), 'seed': 1}
     """
-    return dict(_leaves(settings, ""))
-
-
-def _leaves(node: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Hashable]]:
-    for key, value in node.items():
+    flat: dict[str, Hashable] = {}
+    for key, value in settings.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
+            flat |= {f"{key}.{name}": leaf for name, leaf in flatten(value).items()}
         else:
-            yield f"{prefix}{key}", _hashable(value)
+            flat[str(key)] = _hashable(value)
+    return flat
 
 
 def _hashable(value: Any) -> Hashable:
