@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
-from safe_rl.cli.grammar import run_command
+from safe_rl.cli.grammar import CommandLineError, run_command
+from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
 
 __all__ = ["main"]
@@ -14,5 +16,51 @@ def main(
     arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.evaluate"
 ) -> int:
     """Run the command; return its exit status."""
-    work = "safe_rl.cli.evaluating:carry_out"
-    return run_command(work, arguments, f"{program} RUN_DIR", EvaluationOptions)
+    return run_command(evaluate, arguments, f"{program} RUN_DIR", EvaluationOptions)
+
+
+def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
+    """Evaluate or certify a run, or run it under variations, and print the results.
+
+    Args:
+        words: The folder of the run.
+        options: Options of the command.
+        modules: The user's modules to import; None if ``import=`` was not given.
+
+    Returns:
+        Exit status of the command.
+    """
+    # imported here: help and errors about options do not need torch
+    from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
+    from safe_rl.evaluation.loading import load_config
+    from safe_rl.evaluation.policies import find_run
+
+    directory = find_run(words[0])
+    check_imports(load_config(directory), modules, directory)
+    import_modules(modules)
+    if options.certify:
+        return _certify(directory, options)
+    if options.variations is not None:
+        found, picture = evaluate_varied(directory, options, progress=True)
+        print(found, f"wrote {found.file}", f"wrote {picture}", sep="\n")
+    else:
+        print(evaluate_run(directory, options, progress=True))
+    return 0
+
+
+def _certify(directory: Path, options: EvaluationOptions) -> int:
+    """Certify a run; refuse options that would have no effect on its certificate."""
+    from safe_rl.cli.evaluating import certify_run
+
+    read = {name: getattr(options, name) for name in ("certify", "certificate", "num_threads")}
+    for name, value in vars(EvaluationOptions(**read)).items():
+        if getattr(options, name) != value:
+            raise CommandLineError(
+                f"{name}: it is ignored by certify=true. A certificate is about the run's own "
+                "environment. Its options are certificate.episodes=… and so on, and num_threads=…"
+            )
+    certificate = certify_run(
+        directory, num_threads=options.num_threads, changes=options.certificate
+    )
+    print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
+    return 0 if certificate is not None and certificate.checkpoint is not None else 1

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.report import suite
 from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import KEYS
-from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import (
     Certificate,
     CertificateOptions,
@@ -22,38 +20,14 @@ from safe_rl.evaluation import (
     evaluate,
 )
 from safe_rl.evaluation.loading import load_config
-from safe_rl.evaluation.policies import find_run, writable_copy
+from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.variations import Varied, evaluate_variations
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["carry_out", "certificate_options", "certify_run", "evaluate_run", "evaluate_varied"]
-
-
-def carry_out(words: list[str], options: EvaluationOptions, modules: Sequence[str] | None) -> int:
-    """Evaluate or certify a run, or run it under variations, and print the results.
-
-    Args:
-        words: The folder of the run.
-        options: Options of the command.
-        modules: The user's modules to import; None if ``import=`` was not given.
-
-    Returns:
-        Exit status of the command.
-    """
-    directory = find_run(words[0])
-    check_imports(load_config(directory), modules, directory)
-    import_modules(modules or ())
-    if options.certify:
-        return _certify(directory, options)
-    if options.variations is not None:
-        found, picture = evaluate_varied(directory, options, progress=True)
-        print(found, f"wrote {found.file}", f"wrote {picture}", sep="\n")
-    else:
-        print(evaluate_run(directory, options, progress=True))
-    return 0
+__all__ = ["certificate_options", "certify_run", "evaluate_run", "evaluate_varied"]
 
 
 def evaluate_run(
@@ -69,22 +43,6 @@ def evaluate_run(
         raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
     make = maker_of(directory)
     return evaluate(directory, options, make_env=make, suite=suite(), progress=progress)
-
-
-def _certify(directory: Path, options: EvaluationOptions) -> int:
-    """Certify a run; refuse options that would have no effect on its certificate."""
-    read = {name: getattr(options, name) for name in ("certify", "certificate", "num_threads")}
-    for name, value in vars(EvaluationOptions(**read)).items():
-        if getattr(options, name) != value:
-            raise CommandLineError(
-                f"{name}: it is ignored by certify=true. A certificate is about the run's own "
-                "environment. Its options are certificate.episodes=… and so on, and num_threads=…"
-            )
-    certificate = certify_run(
-        directory, num_threads=options.num_threads, changes=options.certificate
-    )
-    print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
-    return 0 if certificate is not None and certificate.checkpoint is not None else 1
 
 
 def certify_run(

@@ -26,7 +26,7 @@ class ExportOptions:
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
     """Run the command; return its exit status."""
     places = f"{program} RUN_DIR FILE.onnx|FOLDER"
-    return run_command("safe_rl.cli.export:export", arguments, places, ExportOptions)
+    return run_command(export, arguments, places, ExportOptions)
 
 
 def export(words: list[str], options: ExportOptions, modules: list[str] | None) -> int:
@@ -43,7 +43,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
     from safe_rl.runs.folder import RunFolder
 
-    import_modules(modules or ())
+    import_modules(modules)
     run, target = Run(find_run(words[0])), Path(words[1])
     has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")

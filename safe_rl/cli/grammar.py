@@ -10,9 +10,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_type_hints
 
@@ -76,7 +75,6 @@ def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
     given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
     others = [word for word in words if word not in given]
     return [word.partition("=")[2] for word in given], others
-
 
 
 def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
@@ -213,16 +211,18 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
 
 
 def run_command(
-    work: str, arguments: Sequence[str] | None, command: str, schema: type[DataclassInstance]
+    work: Callable[[list[str], Any, list[str] | None], int],
+    arguments: Sequence[str] | None,
+    command: str,
+    schema: type[DataclassInstance],
 ) -> int:
     """Read the arguments of a command, and run it or print its help; return its exit status.
 
     An error is printed as one line; ``HYDRA_FULL_ERROR=1`` shows the traceback instead.
 
     Args:
-        work: ``module:function``, imported when the command runs: help and errors about options
-            need no torch. The function takes the positional arguments, the options, and the
-            modules of ``import=`` or None, and returns the exit status.
+        work: Function of the positional arguments, the options, and the modules of ``import=`` or
+            None; it returns the exit status.
         arguments: The arguments; None: those of the process.
         command: The program, followed by its positional arguments in capitals.
         schema: Dataclass of its options.
@@ -237,9 +237,7 @@ def run_command(
             print(usage(command, schema))
             return 0 if is_help else 2
         first, options = words[: len(places)], parse_options(words[len(places) :], schema)
-        module, _, function = work.partition(":")
-        status: int = getattr(import_module(module), function)(first, options, modules)
-        return status
+        return work(first, options, modules)
     except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -182,7 +182,7 @@ def load(
     """
     run = Run(find_run(directory), checkpoint)
     check_imports(run.config, imports, run.directory)
-    import_modules(imports or ())
+    import_modules(imports)
     loading.find_checkpoint(run.directory, checkpoint)
     return run
 

@@ -89,13 +89,12 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
     """Run the command; return its exit status."""
-    work = "safe_rl.cli.report:carry_out"
-    return run_command(work, arguments, f"{program} RUNS_DIR", ReportOptions)
+    return run_command(carry_out, arguments, f"{program} RUNS_DIR", ReportOptions)
 
 
 def carry_out(words: list[str], options: ReportOptions, modules: list[str] | None) -> int:
     """Report the runs below a folder, the first word, and print what was left out."""
-    import_modules(modules or ())
+    import_modules(modules)
     root = Path(words[0])
     result, page = report(root, options)
     if options.archive is not None:

@@ -90,7 +90,7 @@ def read_command(words: Sequence[str]) -> Command:
         return Command(flags, flags.overrides)
     is_sweep = flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
     modules, overrides = split_imports(flags.overrides)
-    import_modules(modules or ())
+    import_modules(modules)
     resume, overrides = take_word("resume", overrides)
     if resume:
         if is_sweep or flags.cfg:

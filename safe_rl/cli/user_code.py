@@ -34,19 +34,18 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
     return [] if modules is None else list(overrides_of({f"++{KEY}": list(modules)}))
 
 
-def import_modules(modules: str | Sequence[str]) -> None:
+def import_modules(modules: str | Sequence[str] | None) -> None:
     """Import modules, and let configurations name what they define.
 
     Args:
-        modules: One or several: dotted names, also of modules in the current directory, or paths
-            of files.
+        modules: One, several or None: dotted names, also of modules in the current directory, or
+            paths of files.
 
     Raises:
         CommandLineError: If a module does not exist or cannot be imported, or if Python finds
             another module of the same name.
     """
-    modules = [modules] if isinstance(modules, str) else list(modules)
-    for module in modules:
+    for module in [modules] if isinstance(modules, str) else modules or ():
         name, path = module, Path(f"{module.replace('.', '/')}.py")
         if module.endswith(".py"):
             path = Path(module).expanduser()

@@ -59,7 +59,6 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
     return content
 
 
-
 def best_checkpoint(directory: Path) -> Path | None:
     """The checkpoint with the highest score in a folder, the newest among equal ones.
 

@@ -129,7 +129,6 @@ class RunFolder:
             return 0
         return max(0, lines - 1)
 
-
     @property
     def resuming(self) -> str:
         """The argument that continues the run, quoted for a shell."""
