@@ -20,8 +20,9 @@ from safe_rl.naming import did_you_mean
 
 __all__ = ["TargetError", "allow", "build", "locate"]
 
-# Packages and modules with parts of a run. Names are listed where other classes and functions start
-# programs, import modules, or write and remove files; None: all may be named.
+# Packages and modules with parts of a run, and those of the user. Names are listed where other
+# classes and functions start programs, import modules, or write and remove files; None: all may be
+# named.
 _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.algorithms": None,
     "safe_rl.collectors": ("make_process_collector", "make_ray_collector"),
@@ -34,7 +35,6 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.runs.loggers": ("MLflowLogger", "TensorboardLogger", "WandbLogger"),
     "torch.optim": None,
 }
-_users_modules: set[str] = set()
 
 
 class TargetError(ValueError):
@@ -49,7 +49,7 @@ def allow(module: str) -> None:
         >>> build({"_target_": "fractions.Fraction", "numerator": 3}, denominator=4)
         Fraction(3, 4)
     """
-    _users_modules.add(module)
+    _ROOMS[module] = None
 
 
 def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any:
@@ -110,15 +110,15 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     """  # noqa: E501
     shown = f"{key}={target}" if key else f"{target}"
     name = str(target)
-    roots = (*sorted(_users_modules), *_ROOMS)
-    root = next((root for root in roots if name.startswith(f"{root}.")), None)
+    # the user's modules come first: they may contain a room with fewer names
+    root = next((room for room in reversed(_ROOMS) if name.startswith(f"{room}.")), None)
     if root is None:
         module = name.rpartition(".")[0] or name
         raise TargetError(
             f"{shown}: configurations reach only parts of safe_rl, torch.optim and modules of "
             f"yours. If you trust '{module}', add import={module} to the command."
         )
-    known, part = _known(root), name.removeprefix(f"{root}.")
+    known, part = _ROOMS[root], name.removeprefix(f"{root}.")
     if known is not None and part not in known:
         raise TargetError(
             f"{shown}: of '{root}' configurations reach only {', '.join(known)}."
@@ -138,7 +138,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         raise TargetError(f"{shown} is neither a class nor a function.")
     # a module may import, and a class inherit, what configurations must not name
     home = getattr(found, "__module__", None) or ""
-    homes = (room for room in roots if room == root or not _known(room))
+    homes = (room for room, names in _ROOMS.items() if room == root or names is None)
     if not any(f"{home}.".startswith(f"{room}.") for room in homes):
         raise TargetError(
             f"{shown}: it is defined in '{home}', which configurations do not reach, not in "
@@ -159,10 +159,6 @@ def _checked(node: Any, key: str) -> Any:
         locate(copied["_target_"], _join(key, "_target_"))
     return copied
 
-
-def _known(root: str) -> tuple[str, ...] | None:
-    """Names that configurations may use there; None where they may use all."""
-    return None if root in _users_modules else _ROOMS.get(root)
 
 
 def _join(key: str, name: str) -> str:

@@ -29,7 +29,7 @@ def users(monkeypatch):
         module.__dict__,
     )
     monkeypatch.setitem(sys.modules, "users_module", module)
-    monkeypatch.setattr(targets, "_users_modules", set())
+    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
     return module
 
 
@@ -103,7 +103,7 @@ def test_nothing_else_is_reached(name):
 
 
 def test_what_the_package_keeps_to_itself_is_reached_where_the_user_names_its_module(monkeypatch):
-    monkeypatch.setattr(targets, "_users_modules", {"safe_rl.collectors.recording"})
+    monkeypatch.setitem(targets._ROOMS, "safe_rl.collectors.recording", None)
     assert locate("safe_rl.collectors.recording.Recording").__name__ == "Recording"
     with pytest.raises(
         TargetError,

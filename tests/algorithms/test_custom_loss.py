@@ -65,7 +65,7 @@ def test_it_trains_with_several_costs(tmp_path, algo):
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])
 def test_a_run_learns_with_a_loss_of_torchrls(name, tmp_path, monkeypatch):
     """What is not one number for each of its constraints is logged as a scalar."""
-    monkeypatch.setattr(targets, "_users_modules", {"torchrl.objectives"})
+    monkeypatch.setitem(targets._ROOMS, "torchrl.objectives", None)
     keys = ("algo=ppo", f"loss._target_=torchrl.objectives.{name}")
     with pytest.raises(ValueError, match="this one reports none: use max_kl=null and adapt"):
         point_mass_trainer(tmp_path / "kl", *keys).run()

@@ -11,6 +11,7 @@ from point_mass import PointMass
 from run_configs import CONF
 
 import safe_rl.objectives
+import safe_rl.targets
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
@@ -204,7 +205,7 @@ class OwnLoss(safe_rl.objectives.PPOLagrangianLoss):
 
 
 def test_parts_of_ones_own_are_checked_by_what_they_inherit(configs, monkeypatch):
-    monkeypatch.setattr("safe_rl.targets._users_modules", {__name__})
+    monkeypatch.setitem(safe_rl.targets._ROOMS, __name__, None)
     config = configs["ppo_lagrangian", "default"].copy()
     config.lagrangian._target_ = f"{__name__}.OwnMultiplier"
     config.loss._target_ = f"{__name__}.OwnLoss"

@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(user_code, "_imported", [])
-    monkeypatch.setattr(targets, "_users_modules", set())
+    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
     before = set(sys.modules)
     yield tmp_path
     for name in set(sys.modules) - before:

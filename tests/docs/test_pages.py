@@ -82,7 +82,7 @@ def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(user_code, "_imported", [])
-    monkeypatch.setattr(targets, "_users_modules", set())
+    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
     with undone():
         yield tmp_path
     for name, module in list(sys.modules.items()):

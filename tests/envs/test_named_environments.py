@@ -18,7 +18,7 @@ def _as_before(monkeypatch):
     """What a test stores and allows is gone afterwards."""
     group = ConfigStore.instance().repo.setdefault("env", {})
     before = dict(group)
-    monkeypatch.setattr(targets, "_users_modules", set())
+    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
     yield
     group.clear()
     group.update(before)

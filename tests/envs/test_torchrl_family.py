@@ -30,7 +30,7 @@ SMALL = (
 @pytest.fixture
 def trusted(monkeypatch):
     """As after `import=torchrl_envs`."""
-    monkeypatch.setattr(targets, "_users_modules", {"torchrl_envs"})
+    monkeypatch.setitem(targets._ROOMS, "torchrl_envs", None)
 
 
 def test_it_resumes_is_evaluated_and_reported(tmp_path, capsys):
