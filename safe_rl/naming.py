@@ -45,33 +45,23 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
         True
     """
     wanted = _plain(name)
-    close = [found for found in known if _ratio(wanted, _plain(found)) >= likeness]
-    return max(close, key=lambda found: _likeness(name, found), default=None)
 
+    def rank(found: str) -> tuple[bool, bool, float, bool, bool, int]:
+        there = _plain(found)
+        ratio = round(SequenceMatcher(None, there, wanted).ratio(), 6)
+        # ppo_lagrangian begins with PPOLag
+        begins = there.replace("_", "").startswith(wanted.replace("_", ""))
+        has_beginning = begins and len(name) >= _BEGINNING
+        is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
+        length = -abs(len(found) - len(name))
+        return ratio >= likeness, has_beginning, ratio, is_within, is_mixed, length
 
-def _likeness(name: str, found: str) -> tuple[bool, float, bool, bool, int]:
-    """Sort key of similar names, compared element by element.
-
-    First names that begin with the given one, as ppo_lagrangian does with PPOLag; then by the
-    ratio; then names contained in it, names with the same letters, and names of similar length.
-    """
-    wanted, there = _plain(name), _plain(found)
-    begun = len(name) >= _BEGINNING and _letters(there).startswith(_letters(wanted))
-    likeness = round(_ratio(wanted, there), 6)
-    is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
-    return begun, likeness, is_within, is_mixed, -abs(len(found) - len(name))
-
-
-def _ratio(name: str, found: str) -> float:
-    return SequenceMatcher(None, found, name).ratio()
+    best = max(known, key=rank, default=None)
+    return best if best is not None and rank(best)[0] else None
 
 
 def _plain(name: str) -> str:
     return name.lower().replace("-", "_")
-
-
-def _letters(plain: str) -> str:
-    return plain.replace("_", "")
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str:
