@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from difflib import SequenceMatcher
 from typing import Any
 
-__all__ = ["STEPS_TAKEN", "did_you_mean", "key_name", "nearest"]
+__all__ = ["STEPS_TAKEN", "did_you_mean", "join_keys", "key_name", "nearest"]
 
 STEPS_TAKEN = "steps_taken"
 """Key below "next": the number of environment steps that an action was held for, [..., 1]."""
@@ -24,6 +24,11 @@ def key_name(key: str | tuple[Any, ...]) -> str:
         ('agents/cost', 'cost')
     """
     return key if isinstance(key, str) else "/".join(key)
+
+
+def join_keys(above: str, name: str) -> str:
+    """The dotted key of a name below another key, which is "" at the top level."""
+    return f"{above}.{name}" if above else str(name)
 
 
 def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -236,7 +237,6 @@ def _sentence(text: str) -> str:
 
 def _shown(value: Any) -> str:
     """A value as a command line has it, cut if it is long."""
-    written = {None: "null", True: "true", False: "false"}
     is_word = value is None or isinstance(value, bool)
-    shown = written[value] if is_word else " ".join(str(value).split())
+    shown = json.dumps(value) if is_word else " ".join(str(value).split())
     return shown if len(shown) <= 80 else f"{shown[:80]}…"

@@ -16,7 +16,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from safe_rl.naming import did_you_mean
+from safe_rl.naming import did_you_mean, join_keys
 
 __all__ = ["TargetError", "allow", "build", "locate"]
 
@@ -77,7 +77,7 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
     if plain is None:
         return None
     if not isinstance(plain, Mapping) or "_target_" not in plain:
-        raise TargetError(f"{_join(key, '_target_')} is missing: it names the class to build.")
+        raise TargetError(f"{join_keys(key, '_target_')} is missing: it names the class to build.")
     if plain["_target_"] is None:
         return None
     checked = _checked(plain, key)
@@ -154,15 +154,10 @@ def _checked(node: Any, key: str) -> Any:
         return [_checked(item, f"{key}[{index}]") for index, item in enumerate(node)]
     if not isinstance(node, Mapping):
         return node
-    copied = {name: _checked(value, _join(key, str(name))) for name, value in node.items()}
+    copied = {name: _checked(value, join_keys(key, name)) for name, value in node.items()}
     if "_target_" in copied:
-        locate(copied["_target_"], _join(key, "_target_"))
+        locate(copied["_target_"], join_keys(key, "_target_"))
     return copied
-
-
-
-def _join(key: str, name: str) -> str:
-    return f"{key}.{name}" if key else name
 
 
 def _in_words(error: InstantiationException, key: str) -> str:
@@ -170,4 +165,4 @@ def _in_words(error: InstantiationException, key: str) -> str:
     cause = error.__cause__
     inner = str(error).partition("full_key: ")[2]
     words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
-    return f"{_join(key, inner) if inner else key}: {words if cause is not None else error}"
+    return f"{join_keys(key, inner) if inner else key}: {words if cause is not None else error}"

@@ -15,7 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from safe_rl.envs.errors import on_cpu_only
 from safe_rl.evaluation.settings import CertificateOptions, Device
 from safe_rl.files import CONF
-from safe_rl.naming import nearest
+from safe_rl.naming import join_keys, nearest
 from safe_rl.parameters import Parameter, Part, SettingError, parameters_of, read_part
 from safe_rl.ranges import (
     PART,
@@ -167,9 +167,6 @@ def check_settings(config: DictConfig) -> None:
     Custom parts are checked like the package's. Whole numbers written as 3e5 become integers in the
     configuration.
 
-    Args:
-        config: Configuration as composed from ``conf/``.
-
     Raises:
         SettingError: For the first key that does not exist or cannot have its value.
         TargetError: For a part that may not be named or does not exist.
@@ -177,7 +174,7 @@ def check_settings(config: DictConfig) -> None:
     values = plain(config)
     for path, node, part in _nodes(values):
         for name, value in node.items():
-            key = _join(path, name)
+            key = join_keys(path, name)
             if name in part.rows:
                 row = part.rows[name]
                 row.check(key, value)
@@ -201,12 +198,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def unknown_key(key: str, values: Mapping[str, Any]) -> str:
-    """A message that a key does not exist, with similar keys, or the choice that has the key.
-
-    Args:
-        key: The key.
-        values: The configuration, as `plain` returns it.
-    """
+    """A message that a key does not exist, with similar keys, or the choice that has the key."""
     algo, section = values.get("algo") or {}, key.partition(".")[0]
     if section not in values and section in KEYS and section != "note":  # +note= adds a note
         return f"algo={algo.get('name')} has no '{section}'."
@@ -263,7 +255,7 @@ def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
         if not path.startswith((*GIVEN_WHOLE, "default_cost_limits", "paper")):
             settings = part.settings if "_target_" in node else {}
             names = (*(name for name in node if str(name)[0] != "_"), *settings)
-            yield from ((_join(path, name), name in node) for name in names)
+            yield from ((join_keys(path, name), name in node) for name in names)
 
 
 def _nodes(
@@ -288,14 +280,10 @@ def _nodes(
         yield path, values, Part(own, list(own) if is_closed else None)
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _nodes(value, _join(path, name))
+            yield from _nodes(value, join_keys(path, name))
 
 
 def _whole(value: Any) -> Any:
     if isinstance(value, list):
         return [_whole(item) for item in value]
     return int(value) if isinstance(value, float) else value
-
-
-def _join(path: str, name: str) -> str:
-    return f"{path}.{name}" if path else str(name)
