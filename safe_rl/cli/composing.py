@@ -251,12 +251,7 @@ def check_risk(config: DictConfig) -> None:
 
 
 def is_to_keep_limits(config: DictConfig, is_constrained: bool) -> bool:
-    """Whether the algorithm keeps limits, or a transform gives every episode a cost budget.
-
-    Args:
-        config: Configuration of a run.
-        is_constrained: Whether its algorithm constrains costs.
-    """
+    """Whether the algorithm keeps limits, or a transform gives every episode a cost budget."""
     transforms = (config.get("transforms") or {}).values()
     return is_constrained or any("budgets" in transform for transform in transforms)
 
@@ -265,11 +260,6 @@ def compose_resumed(
     directory: Path, texts: Iterable[str], modules: Sequence[str] | None = None
 ) -> DictConfig:
     """Return the configuration of the run in a folder, with the changes that overrides make.
-
-    Args:
-        directory: The folder.
-        texts: Overrides of keys that change from now on.
-        modules: The user's modules; None if ``import=`` was not given.
 
     Raises:
         CommandLineError: If it is not the folder of a run, or a key cannot change.

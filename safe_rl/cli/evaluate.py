@@ -20,16 +20,7 @@ def main(
 
 
 def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
-    """Evaluate or certify a run, or run it under variations, and print the results.
-
-    Args:
-        words: The folder of the run.
-        options: Options of the command.
-        modules: The user's modules to import; None if ``import=`` was not given.
-
-    Returns:
-        Exit status of the command.
-    """
+    """Evaluate or certify a run, or run it under variations, and print the results."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
     from safe_rl.evaluation.loading import load_config

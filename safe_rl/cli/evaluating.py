@@ -58,14 +58,9 @@ def certify_run(
     Raises:
         ValueError: If an option does not exist, or cannot have its value.
     """
-    options = certificate_options(load_config(directory), changes or {})
-    certificate = certify(
-        directory,
-        options,
-        make_env=maker_of(directory),
-        num_threads=num_threads,
-        progress=True,
-    )
+    options = certificate_options(load_config(directory), changes)
+    make = maker_of(directory)
+    certificate = certify(directory, options, make_env=make, num_threads=num_threads, progress=True)
     RunFolder(directory).certifying.unlink(missing_ok=True)
     return certificate
 
@@ -95,11 +90,6 @@ def evaluate_varied(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> tuple[Varied, Path]:
     """Run a policy under ``options.variations``, and write a table and a picture.
-
-    Args:
-        directory: Folder of the run.
-        options: Options of the evaluation.
-        progress: Whether to print each variation when it begins.
 
     Returns:
         The results, and the path of the picture.

@@ -30,13 +30,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_
 
 
 def export(words: list[str], options: ExportOptions, modules: list[str] | None) -> int:
-    """Write a policy to a file, or to a folder.
-
-    Args:
-        words: Folder of the run, and the file or folder to write.
-        options: Options of the command.
-        modules: The user's modules to import.
-    """
+    """Write a policy to a file, or to a folder."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
     from safe_rl.evaluation.loading import find_checkpoint

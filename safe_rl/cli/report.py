@@ -50,14 +50,7 @@ def suite() -> Suite:
 
 
 def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
-    """Report the runs below a folder.
-
-    Args:
-        root: The folder.
-        options: Options of the command.
-
-    Returns:
-        The content of the report, and the path of its page.
+    """Report the runs below a folder; return the content of the report, and its page.
 
     Raises:
         FileNotFoundError: If there is no run.

@@ -32,9 +32,6 @@ def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
     If a folder of that name exists, for example of a run that began in the same second, a number is
     added to the name. A folder that the command line names is used as it is.
 
-    Args:
-        hydra: Hydra's own configuration.
-
     Raises:
         OSError: If the folder cannot be made.
     """
@@ -53,10 +50,6 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     """Note which custom robot a run begins with, and copy its files.
 
     If the files cannot be copied, the note has their hash only, and the reason is printed.
-
-    Args:
-        folder: Folder of the run.
-        env: Node of its environment.
 
     Raises:
         OSError: If a file cannot be written.
@@ -77,9 +70,7 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
 def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
     """Return an environment's node with the robot that a run began with.
 
-    Args:
-        folder: Folder of the run, which may not have begun.
-        env: Node of an environment. It is not changed if it names another robot than the run's.
+    A node that names another robot, or a run that has not begun, changes nothing.
 
     Raises:
         ConfigError: If the file of the robot is gone, or has changed.

@@ -67,9 +67,6 @@ class Command(NamedTuple):
 def read_command(words: Sequence[str]) -> Command:
     """Read a command line; compose and check its configurations before anything is written.
 
-    Args:
-        words: Arguments of ``train.py``.
-
     Raises:
         CommandLineError: If an argument cannot be used; the message says what to write instead.
         ValueError: If a run, a part or an environment cannot have a value.
