@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from signal import Signals
+from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -138,9 +138,12 @@ def resume(
 
 
 def _carry_out(session: Session) -> Run:
-    session.run()
-    if (signal := session.interrupted_by) is not None:
-        raise KeyboardInterrupt if signal is Signals.SIGINT else SystemExit(128 + signal)
+    try:
+        session.run()
+    except SystemExit as end:
+        if end.code == 128 + SIGINT:
+            raise KeyboardInterrupt from None
+        raise
     return Run(session.folder.directory)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from signal import SIGINT, Signals
+from signal import SIGINT
 from typing import Any, cast
 
 from hydra.core.hydra_config import HydraConfig
@@ -61,9 +61,6 @@ class Session:
         program: The command, as the user has called it; None: Python, where the outcome is not
             printed.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
-
-    Attributes:
-        interrupted_by: The signal that has ended the run, or None.
     """
 
     def __init__(
@@ -78,7 +75,6 @@ class Session:
         callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = (),
     ) -> None:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
-        self.interrupted_by: Signals | None = None
         self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
         self._program = program
         self._imports = "".join(f" import={quote(name)}" for name in config.get("import") or [])
@@ -110,6 +106,7 @@ class Session:
         Ctrl-C, SIGTERM or a closed terminal ends the run after the current epoch.
 
         Raises:
+            SystemExit: If a signal has ended the run; the status is 128 and the signal's number.
             Exception: Of any type; `refuses` tells whether the message is enough for the user.
         """
         try:
@@ -130,14 +127,13 @@ class Session:
         if trainer is None:
             if self.folder.certifying.exists():
                 self._certify()
-        elif trainer.interrupted_by is not None:
-            self.interrupted_by = trainer.interrupted_by
-            self._say(outcome)
+            return
+        self._say(outcome)
+        if trainer.interrupted_by is not None:
             _print(f"Interrupted. Continue with: {self._again}")
-        else:
-            self._say(outcome)
-            if is_to_keep_limits(self.config, bool(trainer.algorithm.cost_keys)):
-                self._certify_if_long(trainer.episode_length)
+            raise SystemExit(128 + trainer.interrupted_by)
+        if is_to_keep_limits(self.config, bool(trainer.algorithm.cost_keys)):
+            self._certify_if_long(trainer.episode_length)
 
     def refuses(self, error: Exception) -> bool:
         """Whether an error is about settings, files or the environment: the message is enough."""
@@ -186,7 +182,11 @@ class Session:
         if trainer.algorithm.schedule:
             self._say(trainer.algorithm.schedule)
         if self._continues and trainer.resume():
-            self._say_continued(trainer)
+            print(f"Resuming after {trainer.progress.steps:,} of {config.frames:,} frames.")
+            if trainer.begins_anew:
+                print("The state of its environments is not stored: they begin new episodes.")
+            if trainer.algorithm.lost_on_resume:
+                print(trainer.algorithm.lost_on_resume)
             return trainer
         if self._continues and folder.num_rows:
             print("No checkpoint was written yet: starting over, with a new progress.csv.")
@@ -221,12 +221,6 @@ class Session:
             )
         return build_trainer(config, training, self.folder.directory, in_workers, evaluation)
 
-    def _say_continued(self, trainer: Trainer) -> None:
-        print(f"Resuming after {trainer.progress.steps:,} of {self.config.frames:,} frames.")
-        if trainer.begins_anew:
-            print("The state of its environments is not stored: they begin new episodes.")
-        if trainer.algorithm.lost_on_resume:
-            print(trainer.algorithm.lost_on_resume)
 
     def _write_notes(self, hydra: DictConfig) -> None:
         """Write Hydra's notes; Hydra itself would write them before the run is known to begin."""
@@ -262,8 +256,7 @@ class Session:
                 certificate = certify_run(folder.directory, num_threads=threads)
         except KeyboardInterrupt:
             self._say(f"Interrupted before it was certified. To do so: {self._again}")
-            self.interrupted_by = SIGINT
-            return
+            raise SystemExit(128 + SIGINT) from None
         self._say(str(certificate))
         if certificate is not None and certificate.checkpoint is None:
             self._say(f"To train on: {self._again} frames={2 * self.config.frames:_}")
@@ -284,10 +277,7 @@ def run_job(config: DictConfig) -> float:
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
     check_risk(config)  # for this combination of a sweep's values
-    session = Session(config, folder.directory, hydra, continues=True)
-    session.run()
-    if session.interrupted_by is not None:
-        raise SystemExit(128 + session.interrupted_by)
+    Session(config, folder.directory, hydra, continues=True).run()
     limits = dict(config.cost_limits)
     figures = final_figures(read_table(folder.table), list(limits))
     value = figures["episode_return"]

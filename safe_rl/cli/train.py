@@ -109,9 +109,8 @@ def read_command(words: Sequence[str]) -> Command:
 def main(arguments: Sequence[str] | None = None, program: str = "python train.py") -> int | str:
     """Run the command; return its exit status, or the error message with which it ends.
 
-    Args:
-        arguments: Its arguments; None: those of the process.
-        program: The command, as the user has called it.
+    Raises:
+        SystemExit: If a signal has ended the run.
     """
     say_interruptions()
     session = None
@@ -133,7 +132,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "python train.py
         if not is_expected or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         return " ".join(str(error).split())
-    return 0 if session.interrupted_by is None else 128 + session.interrupted_by
+    return 0
 
 
 class _Parser(ArgumentParser):
