@@ -77,9 +77,12 @@ class Session:
         self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
         self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
         self._program = program
-        self._imports = "".join(f" import={quote(name)}" for name in config.get("import") or [])
-        words = f"{program}{self._imports} {self.folder.resuming}"
-        self._again = words if program else f"safe_rl.resume({str(folder)!r})"
+        modules = list(config.get("import") or [])
+        self._imports = "".join(f" import={quote(name)}" for name in modules)
+        self._again = f"{program}{self._imports} {self.folder.resuming}"
+        if program is None:
+            imports = f", imports={modules}" if modules else ""
+            self._again = f"safe_rl.resume({str(folder)!r}{imports})"
         self._has_begun = False
 
     @classmethod
