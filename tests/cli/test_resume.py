@@ -143,7 +143,7 @@ def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
     actors = "null}\n  resources: {runtime_env: {pip: [theirs]}}"
     for started in ("null, runtime_env: {pip: [theirs]}}", actors):
         path.write_text(local.replace("null}", started))
-        with pytest.raises(CommandLineError, match=r"collector\.\w+\.runtime_env.*could make code"):
+        with pytest.raises(CommandLineError, match=r"collector\.\w+\.runtime_env.*could run code"):
             compose_resumed(run, [])
 
 
