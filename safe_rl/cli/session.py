@@ -22,7 +22,7 @@ from torchrl.checkpoint import CheckpointError
 from safe_rl.cli.composing import check_risk, is_to_keep_limits, resolving
 from safe_rl.cli.evaluating import certify_run
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
-from safe_rl.cli.schema import check_settings
+from safe_rl.cli.schema import check_settings, plain
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.episodes import PeriodicEvaluation, default_seed, has_fixed_layout
@@ -148,14 +148,11 @@ class Session:
 
     def _complete(self) -> None:
         """Add the environment's defaults to its node, so that the saved configuration has them."""
-        given = self._env_node()
+        given = plain(self.config)["env"]
         # keys that are null take the value that is found
         known = {key: value for key, value in given.items() if value is not None}
         with open_dict(self.config):
             self.config.env = complete_env(robot_of(self.folder, given)) | known
-
-    def _env_node(self) -> dict[str, Any]:
-        return cast(dict[str, Any], OmegaConf.to_container(self.config.env, resolve=True))
 
     def _prepare(self) -> Trainer | None:
         """Build the run, or continue the one in the folder; None if that is finished."""
@@ -196,11 +193,11 @@ class Session:
         if config.init_from is not None:
             begin_from(trainer.algorithm, config)
         if not (self._continues and folder.robot_note.exists()):
-            keep_robot(folder, self._env_node())
+            keep_robot(folder, plain(config)["env"])
         return trainer
 
     def _build(self) -> Trainer:
-        config, env = self.config, robot_of(self.folder, self._env_node())
+        config, env = self.config, robot_of(self.folder, plain(self.config)["env"])
         make = partial(
             make_env,
             env,
@@ -223,7 +220,6 @@ class Session:
                 episodes=periodic.episodes,
             )
         return build_trainer(config, training, self.folder.directory, in_workers, evaluation)
-
 
     def _write_notes(self, hydra: DictConfig) -> None:
         """Write Hydra's notes; Hydra itself would write them before the run is known to begin."""
