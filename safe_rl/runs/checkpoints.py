@@ -216,7 +216,9 @@ class CheckpointStore:
             CheckpointError: If no checkpoint can be used (the message is about the newest), or if
                 the run has finished epochs and its checkpoints are missing.
         """
-        _clear_beginnings(self.last)
+        for kind in (self.last, self.best):
+            for unfinished in kind.glob(".checkpoint-*"):
+                unfinished.unlink()
         failures: list[CheckpointError] = []
         restored = None
         for path in reversed(checkpoints_in(self.last)):
@@ -239,7 +241,7 @@ class CheckpointStore:
             warnings.warn(
                 f"{failures[0]} Continuing from the older {restored.name} instead.", stacklevel=2
             )
-        _clear_beginnings(self.best)
+
         for best in checkpoints_in(self.best):
             if restored is None or best.name > restored.name:
                 best.unlink()
@@ -285,9 +287,3 @@ def is_finished(directory: Path, frames: int) -> bool:
             read_facts(path)
             return (checkpoint_steps(path) or 0) >= frames
     return False
-
-
-def _clear_beginnings(directory: Path) -> None:
-    """Remove unfinished checkpoints of a run that was killed."""
-    for unfinished in directory.glob(".checkpoint-*"):
-        unfinished.unlink()
