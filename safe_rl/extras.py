@@ -9,11 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 __all__ = [
-    "check_extra",
-    "hint_of_plugin",
-    "import_extra",
-    "installing",
-    "needs_extra",
+    *("check_extra", "hint_of_plugin", "import_extra", "installing", "needs_extra"),
     "require_extra",
 ]
 

@@ -20,17 +20,9 @@ from zipfile import ZipFile
 import yaml
 
 __all__ = [
-    *(
-        "CONF",
-        "check_no_links",
-        "check_place",
-        "load_tensors",
-        "read_bounded",
-        "read_config",
-        "read_json",
-        "read_yaml",
-    ),
-    *("replace_csv", "replace_json", "replace_text", "replacing", "save_tensors"),
+    *("CONF", "check_no_links", "check_place", "load_tensors", "read_bounded", "read_config"),
+    *("read_json", "read_yaml", "replace_csv", "replace_json", "replace_text", "replacing"),
+    "save_tensors",
 ]
 
 _PACKAGED = Path(__file__).parent / "conf"

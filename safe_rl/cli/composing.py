@@ -23,14 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.grammar import CommandLineError, overrides_of, parse
-from safe_rl.cli.schema import (
-    GIVEN_WHOLE,
-    KEYS,
-    check_settings,
-    plain,
-    unknown_key,
-    unread_by,
-)
+from safe_rl.cli.schema import GIVEN_WHOLE, KEYS, check_settings, plain, unknown_key, unread_by
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
 from safe_rl.envs.families import hint_of_gymnasium

@@ -32,13 +32,7 @@ from safe_rl.ranges import (
 from safe_rl.runs.identity import flatten
 
 __all__ = [
-    "GIVEN_WHOLE",
-    "KEYS",
-    "SettingError",
-    "check_settings",
-    "plain",
-    "unknown_key",
-    "unread_by",
+    *("GIVEN_WHOLE", "KEYS", "SettingError", "check_settings", "plain", "unknown_key", "unread_by"),
 ]
 
 GIVEN_WHOLE = {

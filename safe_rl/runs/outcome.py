@@ -10,15 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 
 __all__ = [
-    *(
-        "FINAL_EPOCHS",
-        "FINAL_STEPS",
-        "feasible_return",
-        "final_figures",
-        "final_rows",
-        "final_width",
-    ),
-    *("judges_another_measure", "keeps", "mean_row", "measured", "violation"),
+    *("FINAL_EPOCHS", "FINAL_STEPS", "feasible_return", "final_figures", "final_rows"),
+    *("final_width", "judges_another_measure", "keeps", "mean_row", "measured", "violation"),
 ]
 
 FINAL_EPOCHS = 5

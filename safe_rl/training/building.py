@@ -31,8 +31,7 @@ from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer
 
 __all__ = [
-    *("begin_from", "build_trainer", "initialise_networks", "physics_threads"),
-    "seed_everything",
+    *("begin_from", "build_trainer", "initialise_networks", "physics_threads", "seed_everything"),
 ]
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
