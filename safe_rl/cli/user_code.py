@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl import targets
-from safe_rl.cli.grammar import IMPORT as KEY
-from safe_rl.cli.grammar import CommandLineError, overrides_of
+from safe_rl.cli.grammar import IMPORT, CommandLineError, overrides_of
 
 __all__ = ["check_imports", "import_modules", "imported", "make_after_imports", "note_imports"]
 
@@ -31,7 +30,7 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
         ["++import=['mine','examples/other.py']"]
     """
     modules = [modules] if isinstance(modules, str) else modules
-    return [] if modules is None else list(overrides_of({f"++{KEY}": list(modules)}))
+    return [] if modules is None else list(overrides_of({f"++{IMPORT}": list(modules)}))
 
 
 def import_modules(modules: str | Sequence[str] | None) -> None:
@@ -51,7 +50,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
             path = Path(module).expanduser()
             name = path.stem
             if not path.is_file():
-                raise CommandLineError(f"{KEY}={module}: there is no such file.")
+                raise CommandLineError(f"{IMPORT}={module}: there is no such file.")
         # the folder is added to the path: other processes import the module by its name
         folder = str(Path.cwd() if name == module else path.resolve().parent)
         if folder not in sys.path:
@@ -59,7 +58,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
         found = _import(name, module)
         if path.is_file() and Path(found).resolve() != path.resolve():
             raise CommandLineError(
-                f"{KEY}={module}: Python has another module of that name, {found}. Rename yours."
+                f"{IMPORT}={module}: Python has another module of that name, {found}. Rename yours."
             )
         targets.allow(name)
         where = module if name == module else str(path.resolve())
@@ -79,12 +78,13 @@ def _import(name: str, given: str) -> str:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
             raise CommandLineError(
-                f"{KEY}={given}: there is no module '{error.name}' here or among the installed "
-                f"ones. A file is named by its path: {KEY}=folder/{error.name}.py."
+                f"{IMPORT}={given}: there is no module '{error.name}' here or among the installed "
+                f"ones. A file is named by its path: {IMPORT}=folder/{error.name}.py."
             ) from None
         *_, last = traceback.extract_tb(error.__traceback__)
         raise CommandLineError(
-            f"{KEY}={given}: {type(error).__name__}: {error} ({last.filename}, line {last.lineno})."
+            f"{IMPORT}={given}: {type(error).__name__}: {error} "
+            f"({last.filename}, line {last.lineno})."
         ) from error
 
 
@@ -105,10 +105,10 @@ def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, 
     Raises:
         CommandLineError: If the run has used modules and ``given`` is None.
     """
-    noted = config.get(KEY) or []
+    noted = config.get(IMPORT) or []
     if given is None and noted:
-        words = " ".join(f"{KEY}={module}" for module in noted)
+        words = " ".join(f"{IMPORT}={module}" for module in noted)
         raise CommandLineError(
             f"{run} was trained with {words}: add that to the command if you trust this code, or "
-            f"'{KEY}=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
+            f"'{IMPORT}=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
@@ -31,10 +31,10 @@ class Role(Enum):
         may_differ: Whether a job of a sweep may continue a run that has another value.
     """
 
-    EXPERIMENT = ("names the experiment: what is restored with a run depends on it", 1, 0, 0)
-    LEARNING = ("names the experiment: a number that a person may turn in between", 1, 1, 0)
+    EXPERIMENT = ("names the experiment: states that are restored with a run depend on it", 1, 0, 0)
+    LEARNING = ("names the experiment: a number that may change during a run", 1, 1, 0)
     LENGTH = ("names the experiment: its runs may be made longer", 1, 1, 1)
-    SEED = ("tells the runs of an experiment apart", 0, 0, 0)
+    SEED = ("distinguishes the runs of an experiment", 0, 0, 0)
     MANNER = ("how a run is carried out: names nothing, and stays", 0, 0, 0)
     MACHINE = ("belongs to the machine", 0, 1, 1)
 
@@ -226,10 +226,8 @@ def check_same_run(directory: Path, config: DictConfig) -> None:
     run = RunFolder(directory)
     if not run.is_run:
         return
-    given = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(given, dict)
-    found = differences(read_config(run.config), given)  # type: ignore[arg-type]
-    if found:
+    given = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+    if found := differences(read_config(run.config), given):
         changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
         raise ValueError(
             f"{directory} holds a run with other settings ({changes}). Move it away, or give the "
