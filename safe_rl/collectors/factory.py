@@ -130,14 +130,15 @@ def make_ray_collector(  # noqa: D417
 
     Args:
         num_collectors: Number of actors W, which divides N.
-        ray_init: Arguments of ``ray.init``, such as ``address``.
+        ray_init: Arguments of ``ray.init``, such as ``address``. With ``log_to_driver: true``, the
+            output of the actors is also printed here, not only to Ray's log files.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
     import ray
 
     # not in start(): the processes of Ray end with the thread that has started them
     if not ray.is_initialized():
-        ray.init(**ray_init)
+        ray.init(**{"log_to_driver": False, **ray_init})
 
     def start(makers: Makers) -> RayCollector:
         collector = RayCollector(

@@ -28,7 +28,7 @@ _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
 _NUM_MARKERS = 6  # of a curve
 _ROW_HEIGHT = 2.4  # of a row of panels [inch]
 _TITLES = ("Return", "Episode cost", "Cost rate")
-_MULTIPLES = 6  # small panels beside each other
+_MULTIPLES = 6  # small panels in a row
 
 
 class Average(NamedTuple):

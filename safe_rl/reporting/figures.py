@@ -41,8 +41,8 @@ LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth
 """Style of the lines at limits."""
 WIDTH = 12.0
 """Width of a figure [inch]."""
-_LEGEND, _LONGEST_LABEL = 140, 60  # of a legend and a line of it: letters beside each other
-_PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; beside each other
+_LEGEND, _LONGEST_LABEL = 140, 60  # widths of a legend and of a line in it [letters]
+_PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; in a row
 _NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation does not have
 
 

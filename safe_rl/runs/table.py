@@ -123,10 +123,14 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
             )
     try:
         columns = zip(*rows, strict=True) if rows else ([] for _ in names)
-        numbers = ([float(field or "nan") for field in column] for column in columns)
-        return dict(zip(names, numbers, strict=True))
+        return {name: list(map(_number, c)) for name, c in zip(names, columns, strict=True)}
     except ValueError as error:
         raise TableError(f"{path} has a field that is no number: {error}.") from None
+
+
+def _number(field: str) -> float:
+    # always the same NaN object: tables with equal numbers are equal
+    return float(field) if field else math.nan
 
 
 def read_table(path: Path) -> dict[str, list[float]]:

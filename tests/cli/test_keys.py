@@ -11,7 +11,6 @@ from point_mass import PointMass
 from run_configs import CONF
 
 import safe_rl.objectives
-import safe_rl.targets
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve

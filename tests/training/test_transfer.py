@@ -92,7 +92,7 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
     actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
     clone = CheckpointStore(tmp_path, {"actor": actor}, keep_last=1).save(10)
     networks = {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)}
-    refuse(networks, clone, "torchrl has no critic, which this run begins with")
+    refuse(networks, clone, "torchrl has no critic, which this run needs")
 
 
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
