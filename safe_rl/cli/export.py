@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from safe_rl.cli.grammar import run_command
-from safe_rl.cli.user_code import import_modules
+from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import option
 
 __all__ = ["ExportOptions", "main"]
@@ -42,6 +42,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
     if target.suffix == ".onnx":
+        check_imports(run.config, modules, run.directory)
         with closing(run.make_env()) as env:
             export_onnx(run.config, env, find_checkpoint(run.directory, which), target)
     else:
