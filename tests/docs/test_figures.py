@@ -165,6 +165,9 @@ def test_quarters_of_what_was_tried_on_hard_tasks():
 HARD = r"^\| (\w+) \| (\d+) \| (\d) million \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$"
 
 
+TESTED = (1321, 2201, 4420)  # the held-out seeds with 2,000 new episodes
+
+
 def test_the_ends_of_the_runs_on_hard_tasks():
     page = (ROOT / "docs" / "algorithms" / "hard_tasks.md").read_text()
     rows = re.findall(HARD, page, re.MULTILINE)
@@ -176,6 +179,13 @@ def test_the_ends_of_the_runs_on_hard_tasks():
         final = "{:.1f} / {:.1f}".format(*last(run, 500_000 / steps))
         above = percent(held(run, steps - 500_000)[1])
         assert cells == [final, above, certificate(run)]
+    tested = [RESULTS / f"held_actions/PointGoal2/sac_lagrangian/lead/seed{n}" for n in TESTED]
+    costs = [new_episodes([run]).split()[0] for run in tested]
+    assert "mean costs of {}, {} and {}".format(*costs) in sentences(page)
+    returns = sorted(
+        float(certificate(run, "{1:.1f}")) for run in [*tested, tested[0].with_name("seed6951")]
+    )
+    assert f"returns of {returns[0]} to {returns[-1]}" in sentences(README)
 
 
 def means(folders, share, form="{:.1f} / {:.1f}"):
@@ -192,13 +202,15 @@ def test_means_without_a_limit(env):
     assert f"| {env} | {ends[0]} |" in README
 
 
-def test_the_table_of_readme_is_a_part_of_the_full_one():
-    full = {(env, algo): (seeds, cells.split(" | ")) for env, algo, seeds, cells in HELD_OUT}
+def test_the_table_of_readme_is_a_part_of_the_full_ones():
+    full = {(e, a): (len(three_million(e, a, seeds)), cells) for e, a, seeds, cells in HELD_OUT}
+    full |= {(e, a): (int(n), cells) for e, a, n, cells in re.findall(ONE_COMMIT, PAGE, re.M)}
     rows = re.findall(r"^\| (\w+) \| .* \| `(\w+)` \| (\d) \| (.+) \|$", README, re.M)
     assert len(rows) == 7
     for env, algo, count, cells in rows:
-        seeds, (end, _, above, certified) = full[env, algo]
-        assert int(count) == len(three_million(env, algo, seeds))
+        number, told = full[env, algo]
+        end, _, above, certified, *_ = told.split(" | ")
+        assert int(count) == number
         assert cells.split(" | ") == [end, above, certified.partition(",")[0]]
 
 
@@ -213,16 +225,19 @@ def new_episodes(folders):
 
 
 def test_the_campaign_at_one_commit():
-    everything, runs = campaign("held_out").values(), 0
+    everything, runs, highest = campaign("held_out").values(), 0, []
     for env, algo, count, cells in re.findall(ONE_COMMIT, PAGE, re.MULTILINE):
         folders = seeds_of(RESULTS / "held_out" / env / algo)
         runs += len(folders)
         assert int(count) == len(folders)
-        assert cells.split(" | ") == [*cells_of(folders), new_episodes(folders)]
+        new = new_episodes(folders)
+        assert cells.split(" | ") == [*cells_of(folders), new]
+        highest.append(float(new.split()[-2]))
     assert runs == len(everything)
     certified = sum(run.notes["certificate"]["certified"] for run in everything)
     assert f"{certified} of the {runs} runs are certified" in PAGE
     assert f"certifies {certified} of {runs} runs" in sentences(README)
+    assert f"mean costs of at most {max(highest)} in 2,000" in sentences(README)
 
 
 def test_the_last_five_epochs_of_the_paper_preset():
