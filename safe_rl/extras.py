@@ -101,7 +101,7 @@ def needs_extra(module: str, extra: str) -> Callable[[T], T]:
 
 
 def check_extra(part: Any) -> None:
-    """Check that the package is installed which a class, one of its bases or a function needs.
+    """Check that the package that a class, one of its bases or a function needs is installed.
 
     Raises:
         ModuleNotFoundError: If it is not installed; the message says how to install it.

@@ -130,15 +130,12 @@ def make_ray_collector(  # noqa: D417
 
     Args:
         num_collectors: Number of actors W, which divides N.
-        ray_init: Arguments of ``ray.init``, such as ``address``. With ``log_to_driver: true``, the
-            output of the actors is also printed here, not only to Ray's log files.
+        ray_init: Arguments of ``ray.init``, such as ``address``; not used if Ray runs already in
+            this process. With ``log_to_driver: true``, the output of the actors is also printed
+            here, not only to Ray's log files.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
     import ray
-
-    # not in start(): the processes of Ray end with the thread that has started them
-    if not ray.is_initialized():
-        ray.init(**{"log_to_driver": False, **ray_init})
 
     def start(makers: Makers) -> RayCollector:
         collector = RayCollector(
@@ -154,4 +151,8 @@ def make_ray_collector(  # noqa: D417
         collector.update_policy_weights_()
         return collector
 
-    return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
+    workers = WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
+    # not in start(): the processes of Ray end with the thread that has started them
+    if not ray.is_initialized():
+        ray.init(**{"log_to_driver": False, **ray_init})
+    return workers

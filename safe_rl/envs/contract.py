@@ -72,7 +72,10 @@ class ConstrainedEnv(EnvBase):
         return TensorDict(batch_size=self.batch_size)
 
     def highest_cost(self, key: str) -> float:
-        """Return the largest cost of an episode: calls of `step` times the bound in the spec."""
+        """Return the largest cost of an episode: calls of `step` times the bound in the spec.
+
+        It is infinite if the spec has no bound.
+        """
         spec = self.full_reward_spec[key]
         highest = float(spec.high.max()) if hasattr(spec, "high") else math.inf
         # the largest number of the dtype stands for no bound

@@ -53,7 +53,8 @@ class Style(NamedTuple):
         colour: Colour of lines and markers.
         marker: Matplotlib's name of the marker.
         line: Style of the line; variants of an algorithm have different ones.
-        is_filled: Whether markers are filled: only those of an algorithm's first family are.
+        is_filled: Whether markers are filled: those of an algorithm's first variant, and of
+            variants that differ from it only in limits.
     """
 
     colour: str

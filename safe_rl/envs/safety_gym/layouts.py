@@ -210,7 +210,7 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield growing ranges of attempts, so that few difficult rows need not thousands of rounds."""
+    """Yield growing ranges of attempts: so a few difficult rows need few rounds."""
     start, most = 0, max(1, _MAX_ROWS // max(1, rows))
     size = 1
     while start < total:

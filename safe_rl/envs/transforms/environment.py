@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from operator import attrgetter
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
@@ -28,10 +27,6 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         cost_keys: Costs of the inner environment, then those of the transforms.
         return_key: Entry below "next" from which returns are computed, `reward` by default.
     """
-
-    max_episode_steps = property(attrgetter("base_env.max_episode_steps"))
-    seconds_per_step = property(attrgetter("base_env.seconds_per_step"))
-    render = property(attrgetter("base_env.render"))
 
     def __init__(
         self, base_env: ConstrainedEnv, transforms: Mapping[str, Transform], seed: int | None = None
@@ -57,6 +52,21 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def _ours(self) -> dict[str, ConstraintTransform]:
         named = zip(self._names, self.transform.transforms, strict=True)
         return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The largest number of steps of an episode."""
+        return self.base_env.max_episode_steps
+
+    @property
+    def seconds_per_step(self) -> float | None:
+        """Simulated duration of a step [s]; None if the environment does not give it."""
+        return self.base_env.seconds_per_step
+
+    @property
+    def render(self) -> Any:
+        """The inner environment's method that draws it; None if it draws no pictures."""
+        return self.base_env.render
 
     @property
     def steps_per_decision(self) -> int:

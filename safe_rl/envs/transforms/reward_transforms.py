@@ -69,7 +69,7 @@ class RewardScale(_ChangesReward):
 
 
 class EarlyTermination(ConstraintTransform):
-    """The episode terminates at the step whose cost exceeds the budget of the episode.
+    """The episode terminates at the step at which its cost so far exceeds the budget.
 
     There is no reward after that, so an algorithm without constraints learns to keep the budget:
     the early terminated MDP of Sun et al. 2021, "Safe Exploration by Solving Early Terminated MDP".
