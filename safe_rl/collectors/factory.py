@@ -148,7 +148,7 @@ def make_ray_collector(  # noqa: D417
             remote_configs=resources,
             num_collectors=num_collectors,
         )
-        collector.update_policy_weights_()
+        collector.update_policy_weights_()  # TorchRL warns if it has not been called
         return collector
 
     workers = WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)

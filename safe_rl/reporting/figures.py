@@ -190,9 +190,7 @@ def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]
 
 
 def draw_variations(
-    rows: Sequence[tuple[Any, Mapping[str, Estimate]]],
-    cost_limits: Mapping[str, float],
-    path: Path,
+    rows: Sequence[tuple[Any, Mapping[str, Estimate]]], cost_limits: Mapping[str, float], path: Path
 ) -> None:
     """Draw return and costs with their intervals over the values of every row.
 

@@ -189,10 +189,7 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(
     ("trouble", "reason"),
-    [
-        (end, "failed to initialize and closed the connection"),
-        (fail, "too many worlds"),
-    ],
+    [(end, "failed to initialize and closed the connection"), (fail, "too many worlds")],
 )
 def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(
     tmp_path, trouble, reason

@@ -180,8 +180,8 @@ def test_the_ends_of_the_runs_on_hard_tasks():
         above = percent(held(run, steps - 500_000)[1])
         assert cells == [final, above, certificate(run)]
     for env, seeds in TESTED.items():
-        folder = RESULTS / "held_actions" / env / "sac_lagrangian" / "lead"
-        *runs, old = (folder / f"seed{n}" for n in (*seeds, 6951))
+        paths = f"held_actions/{env}/sac_lagrangian/lead/seed"
+        *runs, old = (RESULTS / f"{paths}{n}" for n in (*seeds, 6951))
         *costs, end = (new_episodes([run]).split()[0] for run in runs)
         assert f"mean costs of {', '.join(costs)} and {end}" in sentences(page)
         returns = sorted(float(certificate(run, "{1:.1f}")) for run in (*runs, old))
@@ -192,9 +192,7 @@ def means(folders, share, form="{:.1f} / {:.1f}"):
     return form.format(*np.mean([last(folder, share) for folder in folders], axis=0))
 
 
-@pytest.mark.parametrize(
-    "env", ["PointGoal1", "CarGoal1", "PointGoal2", "PointButton1", "PointPush1"]
-)
+@pytest.mark.parametrize("env", [*ENVIRONMENTS, "PointGoal2", "PointButton1", "PointPush1"])
 def test_means_without_a_limit(env):
     form = "{:.1f} / {:.0f}"
     ends = [means(seeds_of(RESULTS / "reference" / env / a), 1 / 6, form) for a in ("ppo", "trpo")]
@@ -210,8 +208,7 @@ def test_the_table_of_readme_is_a_part_of_the_full_ones():
     for env, algo, count, cells in rows:
         number, told = full[env, algo]
         end, _, above, certified, *_ = told.split(" | ")
-        assert int(count) == number
-        assert cells.split(" | ") == [end, above, certified.partition(",")[0]]
+        assert [count, *cells.split(" | ")] == [str(number), end, above, certified.split(",")[0]]
 
 
 def new_episodes(folders):
@@ -238,6 +235,13 @@ def test_the_campaign_at_one_commit():
     assert f"{certified} of the {runs} runs are certified" in PAGE
     assert f"certifies {certified} of {runs} runs" in sentences(README)
     assert f"mean costs of at most {max(highest)} in 2,000" in sentences(README)
+
+
+def test_the_first_command_of_readme():
+    runs = [RESULTS / "first_million" / p for p in campaign("first_million") if "/betting/" in p]
+    returns, costs = kept(runs).removeprefix("6 of 6, at "), new_episodes(runs).partition(" (")[0]
+    six = "In 2,000 new episodes these six policies have mean costs of"
+    assert f"at returns of {returns}. {six} {costs}." in sentences(PAGE)
 
 
 def test_the_last_five_epochs_of_the_paper_preset():
