@@ -317,3 +317,12 @@ def test_what_each_part_contributes():
             mean, above = costs.mean().mean(), costs.agg(lambda c: (c > 25).mean()).mean()
             ends = ", ".join(ends_of_seeds(runs, lambda steps: steps > 2e6))
             assert told == [ends, f"{mean:.1f}, {percent(above)}"]
+
+
+def test_the_two_runs_on_a_gpu():
+    page = (ROOT / "docs" / "guides" / "gpu.md").read_text()
+    for seed in (0, 1321):
+        steps, *both = figures(RESULTS / f"gpu/CarGoal1/ppo_lagrangian/seed{seed}")
+        parts = [(steps > m - 1e6) & (steps <= m) for m in (6e6, 7e6, 8e6)]
+        cells = ["{:.1f} / {:.1f}".format(*(np.nanmean(v[part]) for v in both)) for part in parts]
+        assert f"| {seed} | {' | '.join(cells)} | " in page

@@ -9,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import DeviceCastTransform, TransformedEnv
 
 from safe_rl.envs import ConstrainedEnv
 from safe_rl.envs.transforms import RewardScale, transform_env
@@ -243,7 +244,8 @@ def test_evaluations_in_between_leave_the_draws_of_training_alone_whatever_seedi
 @pytest.mark.gpu
 def test_evaluations_in_between_leave_an_accelerators_draws_alone():
     def make(*, num_envs, seed):
-        return KnownLengths([[2, 2]] * num_envs).to("cuda")
+        env = KnownLengths([[2, 2]] * num_envs)  # its tensors stay on the CPU
+        return TransformedEnv(env, DeviceCastTransform("cuda", orig_device="cpu"))
 
     evaluate = make_evaluation(make, device="cuda", fixed_layout=False)
     before = torch.cuda.get_rng_state()

@@ -67,10 +67,8 @@ def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
         {"name": "c", "x": 3.0},
     ]  # fmt: skip
     looks = {"a&b": "best", "c": "bad"}
-    columns, marks = (
-        {"name": "{name}", "x": spread("x", 1)},
-        {"x": lambda r: looks.get(r["name"], "")},
-    )
+    columns = {"name": "{name}", "x": spread("x", 1)}
+    marks = {"x": lambda r: looks.get(r["name"], "")}
     table = Table("scores", "Scores", columns, records, marks=marks)
     assert [line for line in table.latex().splitlines() if "&" in line] == [
         r"name & x \\", r"a\&b & \textbf{1.2~$\pm$ 0.5} \\",
