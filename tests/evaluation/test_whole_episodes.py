@@ -225,29 +225,19 @@ def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
     assert met == seeds
 
 
-def test_evaluations_in_between_leave_the_draws_of_training_alone_whatever_seeding_does():
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_evaluations_in_between_leave_the_draws_of_training_alone_whatever_seeding_does(device):
     class Seeding(KnownLengths):  # as TorchRL's tutorials have it: torch's generator is seeded
         def _set_seed(self, seed):
             torch.manual_seed(seed)
 
     def make(*, num_envs, seed):
-        env = Seeding([[2, 2]] * num_envs)
+        env = Seeding([[2, 2]] * num_envs)  # its tensors stay on the CPU
         env.set_seed(seed)
-        return env
+        return TransformedEnv(env, DeviceCastTransform(device, orig_device="cpu"))
 
-    evaluate = make_evaluation(make, fixed_layout=False)
-    before = torch.get_rng_state()
+    evaluate = make_evaluation(make, device=device, fixed_layout=False)
+    state = torch.cuda.get_rng_state if device == "cuda" else torch.get_rng_state
+    before = state()
     assert evaluate(0, 100)["evaluation_cost"] == 1.0
-    assert torch.equal(torch.get_rng_state(), before)
-
-
-@pytest.mark.gpu
-def test_evaluations_in_between_leave_an_accelerators_draws_alone():
-    def make(*, num_envs, seed):
-        env = KnownLengths([[2, 2]] * num_envs)  # its tensors stay on the CPU
-        return TransformedEnv(env, DeviceCastTransform("cuda", orig_device="cpu"))
-
-    evaluate = make_evaluation(make, device="cuda", fixed_layout=False)
-    before = torch.cuda.get_rng_state()
-    assert evaluate(0, 100)["evaluation_cost"] == 1.0
-    assert torch.equal(torch.cuda.get_rng_state(), before)
+    assert torch.equal(state(), before)
