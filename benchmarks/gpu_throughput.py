@@ -25,29 +25,18 @@ IDS = ("PointGoal1", "CarGoal1", "DoggoGoal2", "PointButton2")
 TRAIN = Path(__file__).parents[1] / "train.py"
 
 
-def used_memory(device):
-    """Bytes in use on an accelerator; 0 on the CPU, where other things are in the way."""
-    if device.type != "cuda":
-        return 0
-    torch.cuda.synchronize(device)
-    free, total = torch.cuda.mem_get_info(device)
-    return total - free
-
-
 def rate(config, num_envs, steps, device):
-    """Environment steps/s within episodes, and bytes per world."""
-    before = used_memory(device)
+    """Environment steps/s within episodes."""
     env = SafetyGymEnv(config, num_envs, device, seed=0)
     state = env.reset()
     actions = env.action_spec.rand((steps + 1,))
     env._step(state.set("action", actions[0]))
-    memory = (used_memory(device) - before) / num_envs
     start = time.perf_counter()
     for action in actions[1:]:
         env._step(state.set("action", action))
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-    return num_envs * steps / (time.perf_counter() - start), memory
+    return num_envs * steps / (time.perf_counter() - start)
 
 
 def training_rate(name, num_envs, device):
@@ -71,23 +60,20 @@ def main():
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--training", action="store_true", help="whole training steps/s as well")
     arguments = parser.parse_args()
-    print(
-        "| environment | worlds | warp, steps/s | kB a world | CPU, steps/s | training, steps/s |"
-    )
-    print("|---|---|---|---|---|---|")
+    print("| environment | worlds | warp, steps/s | CPU, steps/s | training, steps/s |")
+    print("|---|---|---|---|---|")
     for name in arguments.ids:
         config = resolve(name)
         steps = min(arguments.steps, config.num_steps - 1)
-        on_cpu, _ = rate(config, arguments.cpu_worlds, steps, torch.device("cpu"))
+        on_cpu = rate(config, arguments.cpu_worlds, steps, torch.device("cpu"))
         warp = config.replace(physics="warp")
         for worlds in arguments.worlds:
-            on_warp, memory = rate(warp, worlds, steps, arguments.device)
+            on_warp = rate(warp, worlds, steps, arguments.device)
             trained = "—"
             if arguments.training:
                 trained = f"{training_rate(name, worlds, arguments.device):,.0f}"
             print(
-                f"| {name} | {worlds:,} | {on_warp:,.0f} | {memory / 1e3:,.0f} | {on_cpu:,.0f} "
-                f"| {trained} |",
+                f"| {name} | {worlds:,} | {on_warp:,.0f} | {on_cpu:,.0f} | {trained} |",
                 flush=True,
             )
 
