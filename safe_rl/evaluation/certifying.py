@@ -25,7 +25,7 @@ from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 __all__ = ["Certificate", "certify"]
 
 # number of environments that are stepped together, and of episodes between two checks of a test;
-# where the physics is on a GPU, a step of a thousand environments takes hardly longer
+# a hundred do not fill a GPU
 _BATCH, _BATCH_ON_GPU = 100, 1_000
 # added to the seed: so far apart that no test of a run has the episodes of another run's ranking
 _RANKING, _TEST = 100_000_000_003, 200_000_000_041
