@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -25,8 +27,8 @@ from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 __all__ = ["Certificate", "certify"]
 
 # number of environments that are stepped together, and of episodes between two checks of a test;
-# a hundred do not fill a GPU
-_BATCH, _BATCH_ON_GPU = 100, 1_000
+# MuJoCo Warp takes nearly the same time for a thousand environments as for a hundred
+_BATCH, _BATCH_OF_WARP = 100, 1_000
 # added to the seed: so far apart that no test of a run has the episodes of another run's ranking
 _RANKING, _TEST = 100_000_000_003, 200_000_000_041
 
@@ -116,7 +118,12 @@ def certify(
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
     highest: dict[str, float] = {}
-    first = [next(_run(trial, _RANKING, options.ranking, highest, progress)) for trial in trials]
+    groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
+    first = [
+        episodes
+        for group in groups
+        for episodes in next(_run(group, _RANKING, options.ranking, highest, progress))
+    ]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
     settings = {name: getattr(options, name) for name in asked}
     claim = Claim(limits, highest=highest, **settings)
@@ -125,7 +132,8 @@ def certify(
     returns: dict[int, list[torch.Tensor]] = {}
 
     def collect(number: int) -> Iterator[dict[str, np.ndarray]]:
-        for episodes in _run(trials[number], _TEST, options.episodes, highest, progress):
+        tested = [trials[number]]
+        for (episodes,) in _run(tested, _TEST, options.episodes, highest, progress):
             returns.setdefault(number, []).append(episodes.returns)
             yield _costs(episodes)
 
@@ -154,32 +162,55 @@ def _candidates(folder: RunFolder) -> list[Path]:
     return [found[steps] for steps in sorted(found, key=lambda steps: steps or 0)]
 
 
-def _run(
-    trial: Trial, purpose: int, number: int, highest: dict[str, float], progress: bool
-) -> Iterator[Episodes]:
-    """Batches of episodes with seeds that neither training nor the other purpose uses.
+def _has_warp(trial: Trial) -> bool:
+    return trial.node.get("physics") == "warp"
 
-    A purpose is a ranking or a test. All candidates have the same layouts. A ranking is one batch.
-    In a batch of a test every environment has one episode, so short episodes do not count before
-    long ones. The highest possible cost of an episode is written into ``highest``.
+
+def _run(
+    trials: list[Trial], purpose: int, number: int, highest: dict[str, float], progress: bool
+) -> Iterator[list[Episodes]]:
+    """Batches of episodes with seeds that neither training nor the other purpose uses, per trial.
+
+    A purpose is a ranking or a test. A ranking is one batch. In a batch of a test every environment
+    has one episode, so short episodes do not count before long ones. Trials of one call share the
+    environments of one simulation; trials of several calls have the same layouts. The highest
+    possible cost of an episode is written into ``highest``.
     """
+    trial, together = trials[0], len(trials)
     own = trial.seed  # if the layout is fixed, the seed of training
     seed = own if has_fixed_layout(trial.node) else own + purpose
     trial = replace(trial, options=replace(trial.options, seed=seed))
-    on_gpu = trial.node.get("physics") == "warp" and trial.options.device != "cpu"
-    worlds = min(number, _BATCH_ON_GPU if on_gpu else _BATCH)
+    most = _BATCH_OF_WARP if _has_warp(trial) else _BATCH
+    batch = number if purpose == _RANKING else min(number, most)
+    worlds = batch if together > 1 else min(number, most)
     keys = list(trial.config.cost_limits)
-    batch = number if purpose == _RANKING else worlds
     with (
-        closing(trial.make(worlds)) as env,
+        closing(trial.make(worlds * together)) as env,
         tqdm(total=number, disable=None if progress else True) as bar,
     ):
         highest |= {key: env.highest_cost(key) for key in keys}
-        policy = trial.policy(env)
+        policy = _side_by_side([each.policy(env) for each in trials])
         torch.manual_seed(own + purpose)
         for _ in range(math.ceil(number / batch)):
-            yield collect_episodes(env, policy, batch, keys, deterministic=False)
+            found = collect_episodes(env, policy, batch * together, keys, deterministic=False)
+            # sorted by environment, so those of a trial follow each other
+            columns = [found.returns, found.lengths, *found.costs.values()]
+            parts = zip(*(column.chunk(together) for column in columns), strict=True)
+            yield [
+                Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
+                for returns, lengths, *costs in parts
+            ]
             bar.update(batch)
+
+
+def _side_by_side(policies: list[TensorDictModuleBase]) -> Callable[..., TensorDictBase]:
+    """Let each policy act in an equal share of the environments."""
+
+    def act(state: TensorDictBase) -> TensorDictBase:
+        shares = zip(policies, state.chunk(len(policies)), strict=True)
+        return torch.cat([policy(share) for policy, share in shares])
+
+    return policies[0] if len(policies) == 1 else act
 
 
 def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:

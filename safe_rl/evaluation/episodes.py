@@ -53,7 +53,7 @@ def exploration(deterministic: bool) -> set_exploration_type:
 @torch.no_grad()
 def collect_episodes(
     env: EnvBase,
-    policy: TensorDictModuleBase,
+    policy: Callable[..., TensorDictBase],
     num_episodes: int,
     cost_keys: Sequence[str],
     *,
@@ -68,7 +68,7 @@ def collect_episodes(
 
     Args:
         env: Batched environment, batch_size [N].
-        policy: The policy.
+        policy: The policy: writes the action into the TensorDict of a state.
         num_episodes: Number of episodes E. Worlds that have finished their share continue until all
             have, but their further episodes do not count.
         cost_keys: Keys of the costs to sum, below "next".

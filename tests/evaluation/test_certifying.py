@@ -13,8 +13,10 @@ from run_configs import point_mass_config
 
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
-from safe_rl.evaluation.certifying import _write
+from safe_rl.evaluation.certifying import _RANKING, _run, _write
 from safe_rl.evaluation.loading import find_checkpoint
+from safe_rl.evaluation.measuring import Trial
+from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.reporting.recorded import read_certificate
 from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.certificate import Verdict
@@ -148,6 +150,23 @@ def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train
         certify(directory, OPTIONS, make_env=make)
     assert [len(set(seeds)) for seeds in met.values()] == [2, 2, 2]
     assert len({seed for seeds in met.values() for seed in seeds}) == 6
+
+
+def test_policies_that_share_a_simulation_get_their_own_episodes(monkeypatch):
+    def constant(trial, env):
+        action = float(trial.checkpoint.name)
+        return lambda state: state.set("action", torch.full((len(state), 2), action))
+
+    monkeypatch.setattr(Trial, "policy", constant)
+    config = point_mass_config("cost_limits={cost: 19}", "+env.physics=warp")
+    options = EvaluationOptions(device="cpu", num_threads=1)
+    trials = [Trial(config, Path(action), options, make_env) for action in ("-1", "0", "1")]
+    together = next(_run(trials, _RANKING, 9, {}, progress=False))
+    for trial, found in zip(trials, together, strict=True):
+        (alone,) = next(_run([trial], _RANKING, 9, {}, progress=False))
+        assert found.costs["cost"].shape == (9,)
+        assert found.returns.mean().item() == pytest.approx(alone.returns.mean().item(), rel=0.1)
+    assert len({found.returns.mean().round(decimals=1).item() for found in together}) == 3
 
 
 def test_a_limit_on_the_costliest_episodes_is_certified_for_them(train):

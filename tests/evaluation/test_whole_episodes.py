@@ -55,7 +55,7 @@ class KnownLengths(ConstrainedEnv):
 
     def _reset(self, tensordict=None, **kwargs):
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(self.num, dtype=torch.bool) if mask is None else mask.reshape(self.num)
+        mask = torch.ones(self.num, dtype=torch.bool) if mask is None else mask.flatten().cpu()
         self._episode = self._episode + mask
         self._step_count = torch.where(mask, 0, self._step_count)
         return self._output(torch.zeros(self.num, 1, dtype=torch.bool))
