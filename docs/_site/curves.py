@@ -19,7 +19,8 @@ from safe_rl.cli.report import suite
 from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.curves import draw_experiment, draw_learning_curves, limits_of, set_axes
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles, save
+from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles
+from safe_rl.runs.curves import save_figure
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -37,7 +38,7 @@ def pictures() -> dict[str, bytes]:
         for algo in dict.fromkeys(e.runs[0].algorithm for e in experiments):
             shown = [e for e in experiments if e.runs[0].algorithm == algo]
             figure = draw_learning_curves(shown, styles)
-            made[algo] = save(figure, Path(folder) / f"{algo}.png").read_bytes()
+            made[algo] = save_figure(figure, Path(folder) / f"{algo}.png").read_bytes()
     return made
 
 
@@ -50,7 +51,7 @@ def curves(algo: str) -> str:
 def draw_readme() -> None:
     """Draw what README shows."""
     held = archived("holding_the_limit", "off_policy", steps=3_000_000)
-    picture = save(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
+    picture = save_figure(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
     # a third of the bytes: so many bands over one another have no more colours than fit a palette
     Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
 

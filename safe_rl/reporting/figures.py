@@ -15,15 +15,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from safe_rl.files import replacing
 from safe_rl.reporting.experiments import PACKAGED, Experiment
 from safe_rl.reporting.tables import Record, short_number
+from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import Estimate, pareto_front
 
 __all__ = [
     *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),
-    *("draw_fronts", "draw_variations", "literal", "save", "set_grid"),
+    *("draw_fronts", "draw_variations", "literal", "set_grid"),
 ]
 
 # colours and markers of the package's algorithms; those of the paper come first, in colours of
@@ -113,13 +113,6 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     )  # fmt: skip
     size = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
-
-
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as PNG, SVG or PDF, by the suffix of the file; return the path."""
-    with replacing(path) as unfinished:
-        figure.savefig(unfinished, dpi=120)
-    return path
 
 
 Final = tuple[Experiment, Record]
@@ -224,7 +217,7 @@ def draw_variations(
     for axis in panels.flat:
         axis.set_visible(axis.has_data())
     figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
-    save(figure, path)
+    save_figure(figure, path)
 
 
 def _draw_values(

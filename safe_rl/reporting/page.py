@@ -24,6 +24,7 @@ from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples,
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Table, clean, short_number
+from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import Suite
 
 __all__ = ["Block", "Drawing", "Report", "Section", "build_report", "write_report"]
@@ -228,7 +229,7 @@ def _write(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -
         return ""
     path = place(block.name)
     for form in {*formats, "png"}:
-        figures.save(block.figure, path.with_suffix(f".{form}"))
+        save_figure(block.figure, path.with_suffix(f".{form}"))
     return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 

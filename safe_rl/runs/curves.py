@@ -16,7 +16,7 @@ from matplotlib.transforms import ScaledTranslation
 from safe_rl.files import replacing
 from safe_rl.runs.outcome import final_width, judges_another_measure
 
-__all__ = ["draw_learning_curves", "moving_mean", "point_marker"]
+__all__ = ["learning_curves", "moving_mean", "point_marker", "save_figure"]
 
 _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
 
@@ -30,32 +30,12 @@ class NotebookFigure(Figure):
         return picture.getvalue()
 
 
-def draw_learning_curves(
-    table: Mapping[str, Sequence[float]],
-    cost_limits: Mapping[str, float],
-    episode_length: int,
-    path: Path,
-    title: str = "",
-) -> None:
-    """Write `learning_curves` into a picture file, which is replaced atomically.
-
-    Examples:
-        >>> import tempfile
-        >>> table = {
-        ...     "steps": [1000, 2000],
-        ...     "episode_return": [0.0, 1.0],
-        ...     "episode_cost": [50.0, 30.0],
-        ...     "cost_rate": [0.05, 0.04],
-        ... }
-        >>> path = Path(tempfile.mkdtemp()) / "curves.png"
-        >>> draw_learning_curves(table, {"cost": 25.0}, 1000, path)
-        >>> path.exists()
-        True
-    """
-    figure = learning_curves(table, cost_limits, episode_length, title)
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, SVG or PDF, by the suffix of the file; return the path."""
     # a viewer that watches the file never shows an incomplete picture
     with replacing(path) as unfinished:
         figure.savefig(unfinished, dpi=120)
+    return path
 
 
 def learning_curves(
@@ -75,6 +55,13 @@ def learning_curves(
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
         title: Title above the panels.
+
+    Examples:
+        >>> table = {"steps": [1000, 2000], "episode_return": [0.0, 1.0]}
+        >>> table |= {"episode_cost": [50.0, 30.0], "cost_rate": [0.05, 0.04]}
+        >>> figure = learning_curves(table, {"cost": 25.0}, 1000)
+        >>> save_figure(figure, getfixture("tmp_path") / "curves.png").name
+        'curves.png'
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
     layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; the layout is a pixel or two inexact

@@ -41,7 +41,9 @@ class RunRecord:
 
     Examples:
         >>> import tempfile
-        >>> config = OmegaConf.create({"frames": 200, "logger": None, "algo": {"name": "ppo"}})
+        >>> names = {"algo": {"name": "ppo"}, "env": {"name": "PointGoal1"}}
+        >>> length = {"frames": 200, "frames_per_batch": 200}
+        >>> config = OmegaConf.create({**names, **length, "seed": 0, "logger": None})
         >>> record = RunRecord(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
         >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
         >>> with record.writing():
@@ -97,7 +99,7 @@ class RunRecord:
             if not epoch and self._logger is not None:
                 self._logger.log_hparams(given_settings(self.directory, self._config))
             # whole batches, so that the last one does not go beyond the bar
-            batch = self._config.get("frames_per_batch", 1)
+            batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch
             self._bar = ProgressBar(
                 self.directory, total, steps, self._cost_limits, self._episode_length
@@ -150,15 +152,12 @@ class RunRecord:
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table."""
         # imported here: matplotlib takes half a second
-        from safe_rl.runs.curves import draw_learning_curves
+        from safe_rl.runs.curves import learning_curves, save_figure
 
-        table = read_table(self.folder.table)
-        config = self._config
-        seed = f"seed {config.seed}" if "seed" in config else ""
-        title = f"{config.get('env', {}).get('name', '')} {config.algo.name} {seed}".strip()
-        draw_learning_curves(
-            table, self._cost_limits, self._episode_length, self.folder.curves, title
-        )
+        table, config = read_table(self.folder.table), self._config
+        title = f"{config.env.name} {config.algo.name} seed {config.seed}"
+        figure = learning_curves(table, self._cost_limits, self._episode_length, title)
+        save_figure(figure, self.folder.curves)
 
     def summary(self) -> str:
         """One line about the end of the run."""

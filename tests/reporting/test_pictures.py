@@ -7,8 +7,9 @@ from synthetic import experiments_in, write_run
 
 from safe_rl.files import CONF
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
-from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts, save
+from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts
 from safe_rl.reporting.scoring import final_table
+from safe_rl.runs.curves import save_figure
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
 
@@ -119,7 +120,7 @@ def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
     for name in names:
         panels[0].plot([0, 1], [0, 1], label=name)
     add_legend(figure, panels)
-    save(figure, tmp_path / "legend.png")
+    save_figure(figure, tmp_path / "legend.png")
     (legend,) = figure.legends
     box = legend.get_window_extent()
     assert 0 <= box.x0 < box.x1 <= figure.bbox.width

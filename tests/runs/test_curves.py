@@ -5,10 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from safe_rl.runs.curves import draw_learning_curves, moving_mean
+from safe_rl.runs.curves import learning_curves, moving_mean, save_figure
 
 TABLE = {
     "steps": [100, 200, 300, 400, 500, 600, 700],
@@ -21,23 +20,15 @@ TABLE = {
 
 
 @pytest.fixture
-def drawn(monkeypatch, tmp_path):
+def drawn(tmp_path):
     """Draw, and return the panels that were saved."""
-    figures = []
-    save = Figure.savefig
-
-    def remember(figure, *args, **kwargs):
-        figures.append(figure)
-        return save(figure, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", remember)
 
     def draw(cost_limits, table=TABLE):
-        path = tmp_path / "curves.png"
-        draw_learning_curves(table, cost_limits, 1000, path, "title")
+        figure = learning_curves(table, cost_limits, 1000, "title")
+        path = save_figure(figure, tmp_path / "curves.png")
         assert imread(path).std() > 0
         assert [entry.name for entry in tmp_path.iterdir()] == ["curves.png"]
-        return figures[-1].axes
+        return figure.axes
 
     return draw
 
