@@ -198,7 +198,6 @@ class TrackedConstraints(Constraints):
         tracker: Tracker that estimates J_c and computes its current target.
         multiplier: Multiplier that weighs the costs against the return, or None.
         risk: Risk measure that is limited instead of the mean cost of an episode, or None.
-        cost_advantage: Key of the cost advantages that the multiplier weighs.
         device: Device of all tensors.
     """
 
@@ -211,12 +210,10 @@ class TrackedConstraints(Constraints):
         tracker: LimitTracker,
         multiplier: Multiplier | None = None,
         risk: RiskMeasure | None = None,
-        cost_advantage: NestedKey = "cost_advantage",
         device: torch.device | str | None = None,
     ) -> None:
         super().__init__(limits, multiplier=multiplier, device=device)
         self.tracker, self.risk = tracker, risk
-        self.cost_advantage = cost_advantage
         self._charges: Charges | None = None
         self._row: dict[str, float] = {}
 

@@ -99,12 +99,13 @@ def plain(at):
 
 
 def tracked(at):
-    return TrackedConstraints(
+    constraints = TrackedConstraints(
         {at("cost"): 1.0},
         tracker=LimitTracker(torch.tensor([1.0]), **TRACKER),
         multiplier=LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1),
-        cost_advantage=at("cost_advantage"),
     )
+    constraints.cost_advantage = at("cost_advantage")
+    return constraints
 
 
 @pytest.mark.parametrize("constraints_of", [plain, tracked])
