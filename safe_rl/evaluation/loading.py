@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
@@ -60,7 +61,7 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
 
 
 def limits_of(
-    config: DictConfig, others: Mapping[str, float], cost_keys: Collection[str]
+    config: DictConfig, others: Mapping[str, float], cost_keys: Sequence[str]
 ) -> dict[str, float]:
     """Cost key -> d: the run's limits on costs of the environment, some replaced by others.
 
@@ -72,13 +73,7 @@ def limits_of(
         >>> limits_of(config, {"cost": 10.0}, ["cost", "cost_vases", "cost_hazards"])
         {'cost': 10.0, 'cost_vases': 5.0}
     """
-    for key in others:
-        if key not in cost_keys:
-            raise ValueError(
-                f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}."
-            )
-    limits = {**config.cost_limits, **others}
+    limits = {**config.cost_limits, **check_cost_limits(others, cost_keys)}
     return {key: float(limit) for key, limit in limits.items() if key in cost_keys}
 
 
