@@ -20,8 +20,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 from torchrl.modules import TruncatedNormal as TorchRLTruncatedNormal
 
-from safe_rl.models.action_distributions import choices
-from safe_rl.models.heads import _Components
+from safe_rl.models.heads import _Components, choices
 
 
 class IndependentBeta(Independent):

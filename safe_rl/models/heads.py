@@ -5,12 +5,12 @@ Every row of `HEADS` says for which actions its head is meant; `auto` takes the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
-from tensordict.nn import AddStateIndependentNormalScale
+from tensordict.nn import AddStateIndependentNormalScale, ProbabilisticTensorDictModule
 from torch import Tensor, distributions, nn
 from torch.nn.functional import pad, softplus
 from torchrl.data import (
@@ -22,19 +22,24 @@ from torchrl.data import (
     OneHot,
     TensorSpec,
 )
+from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
-from safe_rl.models.action_distributions import BoundedBeta, choices
-
-__all__ = ["AUTO", "HEADS", "Head", "gaussian_head", "make_head"]
+__all__ = [
+    *("AUTO", "HEADS", "BoundedBeta", "Head", "Shape", "action_sampler", "choices"),
+    *("gaussian_head", "make_head"),
+]
 
 AUTO = "auto"
+Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 # The scale of a policy is exp(log std). The floor is far below the values in use, and only prevents
 # a division by zero.
 _SCALE_FLOOR = 1e-6
 # Logit of choices that do not exist: probability 0, with finite gradients.
 _NO_CHOICE = -1e9
+# Single precision rounds to 0 and 1, where Beta densities are zero or infinite.
+_EDGE = 1e-6
 
 
 class Head(NamedTuple):
@@ -100,6 +105,23 @@ def make_head(
     return HEADS[chosen].make(action_spec, initial_log_std, device)
 
 
+def action_sampler(
+    parameters: Sequence[str],
+    distribution: Callable[..., distributions.Distribution],
+    **settings: Any,
+) -> ProbabilisticTensorDictModule:
+    """Return a module that reads parameters, and writes ``action`` and ``action_log_prob``."""
+    return ProbabilisticTensorDictModule(
+        in_keys=list(parameters),
+        out_keys=["action"],
+        distribution_class=distribution,
+        distribution_kwargs=settings,
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+        default_interaction_type=ExplorationType.RANDOM,
+    )
+
+
 def gaussian_head(
     action_size: int, initial_log_std: float, device: torch.device | None = None
 ) -> Head:
@@ -127,12 +149,79 @@ def _beta(spec: TensorSpec, initial_log_std: float, device: torch.device | None)
     return Head(2 * spec.shape[-1], _Concentrations(), ("alpha", "beta"), make)
 
 
+class BoundedBeta(distributions.Independent):
+    """A Beta distribution in each component of an action between bounds (Chou et al. 2017).
+
+    Its KL divergence is that of the Beta distributions, because it does not depend on the bounds.
+
+    Args:
+        alpha: First concentrations, [..., A].
+        beta: Second concentrations, [..., A].
+        low: Lower bounds, [A].
+        high: Upper bounds, [A].
+
+    Examples:
+        >>> import torch
+        >>> two = torch.full((4, 1), 2.0)
+        >>> BoundedBeta(two, two, low=torch.tensor([0.0]), high=torch.tensor([6.0])).mean[0]
+        tensor([3.])
+    """
+
+    def __init__(self, alpha: Tensor, beta: Tensor, *, low: Tensor, high: Tensor) -> None:
+        super().__init__(distributions.Beta(alpha, beta), 1)
+        self._low, self._width = low, high - low
+
+    def rsample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
+        """Draw actions, differentiably."""
+        return self._stretched(super().rsample(sample_shape))
+
+    def sample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
+        """Draw actions."""
+        with torch.no_grad():
+            return self.rsample(sample_shape)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Logarithm of the density of actions [..., A], in the action's units."""
+        unit = ((value - self._low) / self._width).clamp(_EDGE, 1 - _EDGE)
+        return super().log_prob(unit) - self._width.log().sum(-1)
+
+    def entropy(self) -> Tensor:
+        """Entropy in closed form, [...]."""
+        return super().entropy() + self._width.log().sum(-1)
+
+    @property
+    def mean(self) -> Tensor:
+        """Mean action, [..., A]."""
+        return self._stretched(self.base_dist.mean)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The mean, because the mode is at a bound if a concentration is 1."""
+        return self.mean
+
+    def _stretched(self, unit: Tensor) -> Tensor:
+        return self._low + self._width * unit.clamp(_EDGE, 1 - _EDGE)
+
+
 def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
     """One logit per choice; an action of shape [N] has no dimension of components."""
     numbers = _num_choices(spec)
     if len(spec.shape) == 1:
         return Head(numbers[0], nn.Identity(), ("logits",), distributions.Categorical)
     return Head(sum(numbers), _Components(numbers), ("logits",), choices)
+
+
+def choices(logits: Tensor) -> distributions.Independent:
+    """Return a distribution of independent choices, one for each of A components of an action.
+
+    Args:
+        logits: [..., A, C]; components with fewer than C choices end with very low logits.
+
+    Examples:
+        >>> choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
+        tensor(0.1111)
+    """
+    return distributions.Independent(distributions.Categorical(logits=logits), 1)
 
 
 def _one_hot(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:

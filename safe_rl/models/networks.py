@@ -14,8 +14,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, T
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from safe_rl.models.action_distributions import action_sampler
-from safe_rl.models.heads import Head, gaussian_head
+from safe_rl.models.heads import Head, action_sampler, gaussian_head
 from safe_rl.models.input_scales import InputScale
 from safe_rl.processor import cpuinfo
 
