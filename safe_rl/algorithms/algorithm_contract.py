@@ -99,12 +99,10 @@ class Recipe(ABC):
     """Builds an algorithm from a configuration, which names the recipe as ``algo._target_``.
 
     Attributes:
-        off_policy: Whether it learns from a replay buffer, with Q functions as critics.
         unused_keys: Keys of presets that the recipe does not use, and choices that do not suit it
             (``preset=paper``), each with the reason. A command with one of them is refused.
     """
 
-    off_policy: ClassVar[bool] = False
     unused_keys: ClassVar[Mapping[str, str]] = {}
 
     @classmethod

@@ -70,7 +70,6 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         steps: Environment steps so far.
     """
 
-    off_policy: ClassVar[bool] = True
     unused_keys: ClassVar[Mapping[str, str]] = _UNUSED
     state_names = ("steps", "constraints")
 

@@ -17,10 +17,7 @@ from numpy.typing import ArrayLike
 
 from safe_rl.scores.bounds import best_growth, betting_bound, log_wealth, student_bound
 
-__all__ = ["BOUNDS", "Claim", "Statement", "Verdict", "first_certified", "rank"]
-
-BOUNDS = ("betting", "student")
-"""Bounds of means: one that always holds, and one for costs without rare high ones."""
+__all__ = ["Claim", "Statement", "Verdict", "first_certified", "rank"]
 
 Costs = Mapping[str, ArrayLike]
 
@@ -44,7 +41,7 @@ class Statement:
     is_share: bool = False
 
     def bound(self, level: float, kind: str) -> float:
-        """Upper confidence bound of the mean; `kind` is one of :data:`BOUNDS`."""
+        """Upper confidence bound of the mean; `kind` is "betting" or "student"."""
         if kind == "student" and self.is_share:
             # exact (Clopper and Pearson 1934)
             test = scipy.stats.binomtest(
@@ -83,7 +80,8 @@ class Claim:
         most_over: Largest share of episodes that may cost more than d; 1: no bound.
         level: Confidence of the whole statement.
         highest: Cost key -> the highest possible cost of an episode; infinite if not given.
-        bound: One of :data:`BOUNDS`.
+        bound: Kind of the bounds of means: "betting", which always holds, or "student", for costs
+            without rare high ones.
         cap: Costs of episodes count only up to this value, and at most a share ``most_beyond`` of
             them may cost more. None: no cap, or, for the betting bound if the highest cost is
             infinite, a cap of ten times the limit.
