@@ -22,7 +22,7 @@ from safe_rl.processes import end_with_parent
 from safe_rl.runs.display import LINE_SECONDS
 from safe_rl.runs.folder import RunFolder, RunInUseError
 
-__all__ = ["Sweep", "count_jobs", "threads_per_job"]
+__all__ = ["Sweep", "count_jobs"]
 
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
@@ -37,23 +37,6 @@ def count_jobs(overrides: Sequence[str]) -> int:
     """
     swept = (override for override in map(parse, overrides) if override.is_discrete_sweep())
     return math.prod(len(list(override.sweep_string_iterator())) for override in swept)
-
-
-def threads_per_job(num_jobs: int, num_workers: int, num_cores: int) -> int:
-    """Threads of each job, such that all jobs together use the cores once.
-
-    Args:
-        num_jobs: Jobs of the sweep.
-        num_workers: Jobs at a time. Negative numbers count back from the number of cores, as in
-            joblib; -1 is all cores.
-        num_cores: Cores of the machine.
-
-    Examples:
-        >>> threads_per_job(num_jobs=6, num_workers=-1, num_cores=64)
-        10
-    """
-    workers = num_workers if num_workers > 0 else num_cores + 1 + num_workers
-    return max(1, num_cores // max(1, min(workers, num_jobs)))
 
 
 class Sweep:
@@ -77,8 +60,11 @@ class Sweep:
         self._log = folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}_{self._process}.jsonl"
         num_workers = hydra.launcher.get("n_jobs")
         if num_workers is not None:
-            num_cores = len(os.sched_getaffinity(0))
-            threads = threads_per_job(self._num_jobs, num_workers, num_cores)
+            import joblib  # it comes with this launcher
+
+            # all jobs together use the cores once
+            at_a_time = min(joblib.effective_n_jobs(num_workers), self._num_jobs)
+            threads = max(1, joblib.cpu_count() // at_a_time)
             os.environ["SAFE_RL_NUM_THREADS"] = str(threads)
             # bars of several jobs would overwrite each other
             os.environ.setdefault(LINE_SECONDS, "60")

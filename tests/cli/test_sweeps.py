@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ from registrations import undone
 
 from safe_rl.cli import session
 from safe_rl.cli.composing import resolving
-from safe_rl.cli.sweeps import Sweep, count_jobs, threads_per_job
+from safe_rl.cli.sweeps import Sweep, count_jobs
 from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.display import LINE_SECONDS, ProgressBar
@@ -37,14 +38,14 @@ def test_jobs_are_counted_as_hydra_makes_them(overrides, number):
     assert count_jobs(overrides) == number
 
 
-@pytest.mark.parametrize(
-    ("jobs", "workers", "cores", "threads"),
-    [(8, -1, 4, 1), (2, -1, 8, 4), (8, 2, 8, 4), (8, -2, 8, 1), (1, 16, 2, 2), (9, 16, 2, 1)],
-)
-def test_jobs_at_a_time_share_the_cores(jobs, workers, cores, threads):
-    assert threads_per_job(jobs, workers, cores) == threads
-    workers = workers if workers > 0 else cores + 1 + workers
-    assert threads == 1 or threads * min(jobs, workers) <= cores
+@pytest.mark.parametrize(("workers", "threads"), [(1, 8), (2, 4), (3, 2), (16, 2)])
+def test_jobs_at_a_time_share_the_cores(tmp_path, monkeypatch, workers, threads):
+    monkeypatch.setattr(pytest.importorskip("joblib"), "cpu_count", lambda: 8)
+    monkeypatch.setenv("SAFE_RL_NUM_THREADS", "1")
+    monkeypatch.setenv(LINE_SECONDS, "1")
+    words = {"sweep": {"dir": tmp_path}, "launcher": {"n_jobs": workers}, "sweeper": {}}
+    Sweep(OmegaConf.create(words), ["seed=0,1,2,3"])
+    assert os.environ["SAFE_RL_NUM_THREADS"] == str(threads)
 
 
 @pytest.fixture
