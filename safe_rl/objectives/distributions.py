@@ -62,16 +62,9 @@ def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
 
 def root(distribution: Distribution) -> Distribution:
     """The base distribution, without Independent and without transforms that are not learned."""
-    while isinstance(distribution, Independent | TransformedDistribution):
-        if _may_learn_its_transform(distribution):
-            break
+    while isinstance(distribution, Independent | TanhNormal):
         distribution = distribution.base_dist
     return distribution
-
-
-def _may_learn_its_transform(distribution: Distribution) -> bool:
-    is_transformed = isinstance(distribution, TransformedDistribution)
-    return is_transformed and not isinstance(distribution, TanhNormal)
 
 
 def has_closed_kl(distribution: Distribution) -> bool:
