@@ -6,14 +6,14 @@ A run can start from the networks of another run (Ray, Achiam, Amodei 2019, sect
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -30,9 +30,7 @@ from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer
 
-__all__ = [
-    *("begin_from", "build_trainer", "initialise_networks", "physics_threads", "seed_everything"),
-]
+__all__ = ["begin_from", "build_trainer", "physics_threads", "seed_everything"]
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes the periodic evaluation of a policy that is trained."""
@@ -115,36 +113,15 @@ def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
 
 
 def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
-    """Load the networks of ``init_from`` into an algorithm; see `initialise_networks`."""
-    taken = initialise_networks(
-        algorithm.networks,
-        Path(config["init_from"]),
-        algorithm.cost_keys,
-        _cost_loss(config),
-        algorithm.cost_networks,
-    )
-    algorithm.networks_replaced()
-    return taken
-
-
-def initialise_networks(
-    networks: Mapping[str, nn.Module],
-    source: Path,
-    cost_keys: Sequence[str],
-    cost_loss: str | None = None,
-    cost_networks: Collection[str] = ("cost_critic",),
-) -> list[str]:
-    """Load the trained weights of another run into networks.
+    """Load the trained weights of the run that ``init_from`` names into an algorithm's networks.
 
     Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
     if that run had the same constrained costs and, with Q functions, the same loss.
 
     Args:
-        networks: Networks of the new run by name, changed in place.
-        source: Folder of the other run, whose newest checkpoint is read, or a checkpoint.
-        cost_keys: Keys of the new run's constrained costs.
-        cost_loss: Loss of the new run's cost critics if they are Q functions.
-        cost_networks: Names of the networks of costs.
+        algorithm: The algorithm of the new run.
+        config: Its configuration. ``init_from`` is the folder of the other run, whose newest
+            checkpoint is read, or a checkpoint.
 
     Returns:
         Names of the networks that were loaded.
@@ -153,14 +130,15 @@ def initialise_networks(
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
             shapes. Then nothing has been changed.
     """
+    source = Path(config["init_from"])
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
     checkpoint = _newest(source) if source.is_dir() else source
-    same_costs = _cost_critics(checkpoint) == (list(cost_keys), cost_loss)
+    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _cost_loss(config))
     taken = {
         name: network
-        for name, network in networks.items()
-        if same_costs or name not in cost_networks
+        for name, network in algorithm.networks.items()
+        if same_costs or name not in algorithm.cost_networks
     }
     weights = read_states(checkpoint)
     if absent := [name for name in taken if name not in weights]:
@@ -172,6 +150,7 @@ def initialise_networks(
         _check_shapes(name, network.state_dict(), weights[name], checkpoint)
     for name, network in taken.items():
         network.load_state_dict(weights[name])
+    algorithm.networks_replaced()
     return list(taken)
 
 

@@ -18,7 +18,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
-from safe_rl.training.building import build_trainer, initialise_networks, seed_everything
+from safe_rl.training.building import begin_from, build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
 
@@ -104,7 +104,7 @@ def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     assert table["q_loss"][-1] < table["q_loss"][0]
     assert "cost" in line
     second = make_trainer("second", "seed=1")
-    taken = initialise_networks(second.algorithm.networks, tmp_path / "run", [])
+    taken = begin_from(second.algorithm, {"init_from": tmp_path / "run"})
     assert taken == ["explorer", "q"]
     assert torch.equal(second.algorithm.policy.bias, trainer.algorithm.policy.bias)
     config, env = load_config(tmp_path / "run"), PointMass(2, 20)

@@ -1,6 +1,7 @@
 """Starting from trained networks: what is taken over, and what does not fit."""
 
 import copy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.models import QEnsemble, make_bounded_actor
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.training.building import initialise_networks
+from safe_rl.training.building import begin_from
 
 pytestmark = pytest.mark.long
 
@@ -33,18 +34,16 @@ def make_fresh(trained, *overrides):
 
 def take_over(trained, *overrides):
     fresh = make_fresh(trained, *overrides)
-    networks, algorithm = fresh.algorithm.networks, fresh.algorithm
-    assert not same(networks["actor"], trained.algorithm.actor)
-    source = trained.record.directory
-    return fresh, initialise_networks(networks, source, list(algorithm.cost_keys))
+    assert not same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
+    return fresh, begin_from(fresh.algorithm, {"init_from": trained.record.directory})
 
 
-def refuse(networks, source, match, cost_keys=()):
+def refuse(algorithm, source, match):
     """The networks do not fit, which the message says, and they stay as they were."""
-    before = {name: copy.deepcopy(network) for name, network in networks.items()}
+    before = copy.deepcopy(dict(algorithm.networks))
     with pytest.raises(CheckpointError, match=match):
-        initialise_networks(networks, source, cost_keys)
-    assert all(same(before[name], network) for name, network in networks.items())
+        begin_from(algorithm, {"init_from": source})
+    assert all(same(before[name], network) for name, network in algorithm.networks.items())
 
 
 def test_all_networks_are_taken_over_and_nothing_else(trained):
@@ -83,8 +82,7 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
-    networks = make_fresh(trained, override).algorithm.networks
-    refuse(networks, trained.record.directory, message, ["cost"])
+    refuse(make_fresh(trained, override).algorithm, trained.record.directory, message)
 
 
 def test_what_a_run_has_not_learned_is_named(tmp_path):
@@ -92,9 +90,10 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
     actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
     clone = CheckpointStore(tmp_path, {"actor": actor}, keep_last=1).save(10)
     networks = {"actor": actor, "critic": QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)}
-    refuse(networks, clone, "torchrl has no critic, which this run needs")
+    algorithm = SimpleNamespace(networks=networks, cost_keys=[], cost_networks=[])
+    refuse(algorithm, clone, "torchrl has no critic, which this run needs")
 
 
 def test_a_folder_without_a_checkpoint(trained, tmp_path):
     with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
-        initialise_networks(trained.algorithm.networks, tmp_path, ["cost"])
+        begin_from(trained.algorithm, {"init_from": tmp_path})
