@@ -73,7 +73,7 @@ def make_collector(
     )
 
 
-def make_process_collector(
+def make_process_collector(  # noqa: D417
     env: EnvBase,
     make_env: MakeEnv,
     policy: TensorDictModuleBase,
@@ -82,18 +82,11 @@ def make_process_collector(
     num_collectors: Annotated[int, Range(1, 1024)],
     device: torch.device | str,
 ) -> WorkerCollector:
-    """Collect in processes of this machine.
+    """Collect in processes of this machine; for other arguments see `WorkerCollector`.
 
     Args:
-        env: The run's environment. Its rows are divided among workers; it is not stepped itself.
-        make_env: Function that makes such an environment with fewer rows, in a worker.
         policy: Policy, whose weights are sent to the workers.
-        frames_per_batch: Steps of all rows together in one batch, N·T.
         num_collectors: Number of processes W, which divides N.
-        device: Device of policy and batches.
-
-    Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
     """
 
     def start(makers: Makers) -> MultiSyncCollector:
@@ -126,7 +119,7 @@ def make_ray_collector(  # noqa: D417
     ray_init: Options,
     resources: Options,
 ) -> WorkerCollector:
-    """Collect in actors of a Ray cluster; for other arguments see `make_process_collector`.
+    """Collect in actors of a Ray cluster; for other arguments see `WorkerCollector`.
 
     Args:
         num_collectors: Number of actors W, which divides N.
