@@ -94,11 +94,11 @@ def test_static_bodies_stop_the_robot_and_contacts_can_cost():
     assert costs[-1] == 1.0
 
 
-def test_contacts_that_nothing_counts_are_an_error_that_says_so():
-    cost = Cost("cost_walls", lambda c: True, lambda c, w: contact_cost(w.contacts_with("walls")))
-    register_cost(cost)
-    with pytest.raises(KeyError, match=r"'walls'.*'touches'"):
-        make({"walls_num": 1}).rollout(1)
+@pytest.mark.parametrize(("kind", "touches"), [("walls", ()), ("hazards", ("hazards",))])
+def test_contacts_that_nothing_counts_are_an_error_that_says_so(kind, touches):
+    register_cost(Cost("cost_odd", bool, lambda c, w: w.contacts_with(kind).sum(-1), touches))
+    with pytest.raises(KeyError, match=rf"'{kind}'.*'touches'.*Areas"):
+        make({f"{kind}_num": 1}).rollout(1)
 
 
 @pytest.mark.parametrize("read", ["at", "start_of", "velocity_of", "contacts_with"])

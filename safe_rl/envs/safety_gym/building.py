@@ -107,7 +107,7 @@ def _add_sensors(
     )
     sensors: dict[str, list[str]] = {}
     for element in present:
-        if element.kind not in touched:
+        if element.kind not in touched or element.motion is Motion.VIRTUAL:
             continue
         for name in element.names(config):
             spec.add_sensor(

@@ -150,7 +150,7 @@ class World:
         if kind in self.scene.slots:
             raise KeyError(
                 f"Contacts with '{kind}' are not counted: list it in 'touches' of the task, cost "
-                "or observation that reads them."
+                "or observation that reads them. Areas (Motion.VIRTUAL) have no contacts."
             )
         return self.sensordata[:, self._slots(kind)]
 
