@@ -128,10 +128,8 @@ WRONG = {
         "cost_odd must be 0 or more, got nan: give",
     ),
     "reward": (lambda: wrong_task(lambda c, w, b, n: 1.0), r"'reward' .*\[2\].* a float"),
-    "no reward": (
-        lambda: wrong_task(lambda c, w, b, n: torch.tensor([0.5, math.nan])),
-        "'reward' of task 'odd' is NaN",
-    ),
+    "no reward": (lambda: wrong_task(lambda c, w, b, n: math.nan * w.up), "'reward' .* is NaN"),
+    "no bodies": (lambda: wrong_cost(lambda c, w: w.velocity_of("hazards")), "'hazards' are not"),
     "met": (
         lambda: wrong_task(
             lambda c, w, b, n: n[:, 0],
@@ -155,7 +153,7 @@ def test_rows_that_return_something_else_are_named(register, told):
     register()
     task = "odd" if "odd" in TASKS else "none"
     with pytest.raises(ConfigError, match=told):
-        SafetyGymEnv({**POINT, "task": task}, num_envs=2, seed=0).rollout(1)
+        SafetyGymEnv({**POINT, "task": task, "hazards_num": 1}, num_envs=2, seed=0).rollout(1)
 
 
 def test_free_bodies_are_pushed_and_have_a_density():

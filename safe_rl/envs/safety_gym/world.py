@@ -137,7 +137,9 @@ class World:
 
     def velocity_of(self, kind: str) -> Tensor:
         """Return linear velocities of one kind's free bodies [N, K, 3], a view."""
-        return self.velocities[:, self._slots(kind)]
+        if (slots := self._slots(kind)).stop > self.scene.num_free:
+            raise ConfigError(f"'{kind}' are not free bodies, so they have no velocity.")
+        return self.velocities[:, slots]
 
     def contacts_with(self, kind: str) -> Tensor:
         """Return the number of the robot's contacts with each object of a kind [N, K], a view.
@@ -165,11 +167,9 @@ class World:
         )
 
     def _slots(self, kind: str) -> slice:
-        if kind not in self.scene.kinds:
-            raise ConfigError(
-                f"There is no kind '{kind}' of objects.{nearest(kind, self.scene.kinds)} There are "
-                f"{', '.join(self.scene.kinds)}."
-            )
+        if kind not in (kinds := self.scene.kinds):
+            hint = f"{nearest(kind, kinds)} There are {', '.join(kinds)}."
+            raise ConfigError(f"There is no kind '{kind}' of objects.{hint}")
         return self.scene.slots.get(kind, slice(0, 0))
 
 
