@@ -168,7 +168,7 @@ WRONG = {
         "control range.*2.0, -0.5",
     ),
     "an observed slide": (changed(DISC, "</sensor>", SLIDE), "'east' on a slide joint"),
-    "a name of the world": (changed(DISC, 'name="arm"', 'name="vase0"'), "does not fit.*vase0"),
+    "a name of the world": (changed(DISC, 'name="arm"', 'name="vase0"'), "repeated name 'vase0'"),
 }  # fmt: skip
 
 

@@ -67,8 +67,8 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
         model = spec.compile()
     except ValueError as error:
         raise ConfigError(
-            f"'robot_base': {config.robot_base} does not fit into the world: {error}. If a name is "
-            "repeated, rename the robot's part: it has the name of an object in the world."
+            f"MuJoCo cannot build the world of 'robot_base' {config.robot_base}: {error}. If a "
+            "name is repeated, rename the robot's part: it has the name of an object in the world."
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
     scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
