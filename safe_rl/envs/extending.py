@@ -139,6 +139,8 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
     _refuse_taken("task", name)
     for kinds in (task.elements, task.touches, task.at_origin):
         _refuse_unknown_kinds(kinds)
+    for kind in (kind for kind in task.elements if not BY_KIND[kind].singular):
+        raise ConfigError(f"Task '{name}' cannot add '{kind}': set the key '{kind}_num' instead.")
     if task.met is not None and "goal" not in task.elements:
         raise ConfigError(f"Task '{name}' meets goals: add 'goal' to its elements.")
     _add_keys(keys)
@@ -219,11 +221,9 @@ def _refuse_taken(what: str, name: str) -> None:
 def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
     if isinstance(kinds, str):
         raise ConfigError(f"'{kinds}' is a text: give the kinds in a tuple, ('{kinds}',).")
-    for kind in kinds:
-        if kind not in BY_KIND:
-            raise ConfigError(
-                f"There is no element '{kind}'.{nearest(kind, BY_KIND)} Register the element first."
-            )
+    for kind in (kind for kind in kinds if kind not in BY_KIND):
+        hint = nearest(kind, BY_KIND)
+        raise ConfigError(f"There is no element '{kind}'.{hint} Register the element first.")
 
 
 def _keys_of(element: Element) -> dict[str, Key]:

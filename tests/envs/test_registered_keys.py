@@ -79,6 +79,7 @@ WRONG = {
         lambda: register_task("visit", Task(max, met=lambda c, w, now: now[:, 0] < 1)),
         "'visit'.*'goal'",
     ),
+    "many of a kind": (lambda: register_task("new", Task(max, elements=("vases",))), "'vases_num'"),
     "contacts with nothing known": (
         lambda: register_cost(Cost("cost_mines", bool, max, touches=("pilars",))),
         "'pilars'.*'pillars'",
