@@ -190,6 +190,8 @@ def _describe(
 ) -> tuple[list[str], int]:
     if num_steps is not None:
         require_integer("num_steps", num_steps, lowest=1)
+    if isinstance(cost_keys, str):
+        raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
     probe = make()
     if not isinstance(probe, gymnasium.Env):
         raise ConfigError(f"The function must return a gymnasium.Env, but it returned {probe!r}.")
