@@ -218,7 +218,7 @@ _PLAIN: dict[Any, Values] = {
 
 
 class Checked:
-    """Base of classes whose constructors refuse keyword arguments that do not fit annotations.
+    """Base of classes whose constructors refuse arguments that do not fit their annotations.
 
     Numbers, texts and lists are checked; other objects are not.
 
@@ -244,13 +244,13 @@ def _checked(init: Callable[..., None]) -> Callable[..., None]:
             parameters = signature(init, eval_str=True).parameters.values()
         except NameError:  # a name that is imported for type checkers only
             return {}
-        described = (p for p in parameters if is_described(p.annotation))
-        return {p.name: values_of(p.annotation) for p in described}
+        return {p.name: values_of(p.annotation) for p in parameters if is_described(p.annotation)}
 
     @wraps(init)
     def checking(self: Any, *args: Any, **kwargs: Any) -> None:
+        given = dict(zip(signature(init).parameters, (self, *args), strict=False)) | kwargs
         for name, values in allowed().items():
-            value = kwargs.get(name)
+            value = given.get(name)
             if isinstance(value, int | float | str | list | tuple) and not values.hold(value):
                 raise ValueError(f"{name}={value}: it must be {values.words}.")
         init(self, *args, **kwargs)

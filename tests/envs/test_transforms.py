@@ -241,7 +241,7 @@ def filtered(function):
         (lambda: Saute({"cost": 0.0}, **SAUTE), "above 0"),
         (lambda: EarlyTermination({"cost": math.nan}), "at least 0"),
         (lambda: transformed(PointMass(1), "saute", "simmer"), "one of saute and simmer"),
-        (lambda: ActionRepeat(k=0), "k=0: it must be a whole number from 1"),
+        (lambda: ActionRepeat(0), "k=0: it must be a whole number from 1"),
         (
             lambda: filtered(lambda step: step["action"][:, :1]).rollout(1),
             r"actions of shape \(1, 2\), got \(1, 1\)",
