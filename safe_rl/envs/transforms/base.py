@@ -97,14 +97,11 @@ def check_budgets(budgets: Mapping[str, float], *, above_zero: bool) -> dict[str
     return checked
 
 
-def check_known(budgets: Collection[str], cost_keys: Collection[str]) -> None:
-    """Raise ValueError for a budget of an unknown cost."""
-    for key in budgets:
-        if key not in cost_keys:
-            raise ValueError(
-                f"budgets names '{key}', but there is no such cost.{did_you_mean(key, cost_keys)} "
-                f"There are {', '.join(cost_keys) or 'none'}."
-            )
+def check_known(names: Collection[str], cost_keys: Collection[str]) -> None:
+    """Raise ValueError for an unknown cost."""
+    for key in (name for name in names if name not in cost_keys):
+        hint, known = did_you_mean(key, cost_keys), ", ".join(cost_keys) or "none"
+        raise ValueError(f"There is no cost '{key}'.{hint} There are {known}.")
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:

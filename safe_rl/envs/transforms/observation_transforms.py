@@ -184,7 +184,7 @@ class ObservedCosts(ConstraintTransform):
 
     Args:
         decay: Weight of the past in the trace.
-        costs: Names of the costs that are observed; None: all.
+        costs: Names of the costs that are observed; None or an empty list: all.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -196,12 +196,11 @@ class ObservedCosts(ConstraintTransform):
     def __init__(self, decay: Weight, costs: Sequence[Text] | None = None) -> None:
         super().__init__()
         self._decay = decay
-        self._takes_all, self._costs = costs is None, list(costs or ())
+        self._costs = list(costs or ())
 
     def check(self, cost_keys: Collection[str]) -> None:
         """Take all costs if none are named; raise ValueError for an unknown one."""
-        if self._takes_all:
-            self._takes_all, self._costs = False, list(cost_keys)
+        self._costs = self._costs or list(cost_keys)
         check_known(self._costs, cost_keys)
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
