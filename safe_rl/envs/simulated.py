@@ -246,8 +246,10 @@ class SimulatedEnv(ConstrainedEnv):
 
         Raises:
             OpenGLError: If OpenGL is missing; the message names the package to install.
-            ValueError: For an unknown camera.
+            ValueError: For an unknown camera, or a frame without pixels.
         """
+        if min(width, height) < 1:
+            raise ValueError(f"A frame needs at least one pixel, got {width} x {height}.")
         everyone = range(self.batch_size[0])
         chosen = [rows] if isinstance(rows, int) else list(everyone if rows is None else rows)
         camera = self.first_camera if camera is None else camera

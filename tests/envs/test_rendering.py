@@ -82,6 +82,8 @@ def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
         env.render(0, camera="eye")
     with pytest.raises(ValueError, match="Did you mean 'fixedfar'"):
         env.render(0, camera="fixdfar")
+    with pytest.raises(ValueError, match="at least one pixel, got 480 x 0"):
+        env.render(0, height=0)
 
 
 @needs_opengl
