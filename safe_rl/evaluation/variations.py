@@ -10,12 +10,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.loading import (
-    check_env_keys,
-    find_checkpoint,
-    load_config,
-    override_env,
-)
+from safe_rl.evaluation.loading import check_env_keys, find_checkpoint, load_config, override_env
 from safe_rl.evaluation.measuring import Trial, check_places, format_unjudged, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
@@ -247,6 +242,9 @@ def evaluate_variations(
     checkpoint = find_checkpoint(directory, options.checkpoint)
     file, picture = (RunFolder(directory).variations(options.name, kind) for kind in ("csv", "png"))
     check_places([file, picture])
+    for variation in variations:  # a wrong key is found before the first episode
+        if not variation.may_lack and (changed := varied(config, variation)) is not None:
+            Trial(changed, checkpoint, options, make_env).make(num_envs=1).close()
     rows: list[VariedRow] = []
     left_out: list[tuple[Variation, str]] = []
     facts: dict[str, Any] = {}
