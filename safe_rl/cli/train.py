@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from safe_rl.cli.composing import (
@@ -24,7 +25,7 @@ from safe_rl.cli.composing import (
     resolving,
     search_folders,
 )
-from safe_rl.cli.grammar import CommandLineError, say_interruptions, split_imports, take_word
+from safe_rl.cli.grammar import CommandLineError, parse, say_interruptions, split_imports, take_word
 from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES
@@ -199,10 +200,17 @@ def _ask_hydra(command: Command) -> int:
         else:
             from safe_rl.cli.sweeps import Sweep
 
-            with resolving(command.configs[0]):
-                sweep = Sweep(command.configs[0].hydra, words)
+            first = command.configs[0]
+            with resolving(first):
+                sweep = Sweep(first.hydra, words)
             try:
-                hydra.multirun("config", sweep, ["hydra.mode=MULTIRUN", *words])
+                # Hydra's own plan lacks the keys that only swept choices, such as of algo=, have
+                given = first.hydra.overrides
+                job = ["hydra.mode=MULTIRUN", *given.hydra, *given.task]
+                plan = hydra.compose_config("config", job, RunMode.MULTIRUN, True)
+                plan.hydra.overrides.task = [w for w in words if not parse(w).is_hydra_override()]
+                hydra.compose_config = lambda **_: plan
+                hydra.multirun("config", sweep, [])
             finally:
                 are_finished = sweep.print_summary()
             return 0 if are_finished else 1

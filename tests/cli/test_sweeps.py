@@ -137,14 +137,14 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     if launcher == "joblib":
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     # the constrained algorithm cannot work without a limit, the other one does not need any
-    jobs = ["env=PointGoal1", "algo=ppo,ppo_lagrangian", "seed=0,10", f"hydra/launcher={launcher}"]
-    jobs += ["default_cost_limits=null", "cost_limits={}"]
+    jobs = ["env=PointGoal1", "algo=trpo,cpo", "seed=0,10", f"hydra/launcher={launcher}"]
+    jobs += ["default_cost_limits=null", "cost_limits={}", "policy_update.target_kl=0.01"]
     first = sweep(tmp_path, *jobs, status=1)
     assert "Sweep: 2 of 4 runs are finished." in first
     assert first.count("needs at least one entry in cost_limits") == 2
-    tables = sorted(tmp_path.glob("PointGoal1/ppo/*/seed*/progress.csv"))
+    tables = sorted(tmp_path.glob("PointGoal1/trpo/*/seed*/progress.csv"))
     assert [table.parent.name for table in tables] == ["seed0", "seed10"]
-    assert not list(tmp_path.glob("PointGoal1/ppo_lagrangian/*/*/progress.csv"))
+    assert not list(tmp_path.glob("PointGoal1/cpo/*/*/progress.csv"))
     before = [table.stat().st_mtime_ns for table in tables]
     assert sweep(tmp_path, *jobs, status=1).count("has its 120 frames already") == 2
     assert [table.stat().st_mtime_ns for table in tables] == before
