@@ -80,7 +80,7 @@ class Run:
     @property
     def limits(self) -> dict[str, float]:
         """Cost key -> d, undiscounted cost per episode."""
-        return {key: float(d) for key, d in (self.config["cost_limits"] or {}).items()}
+        return {key: float(d) for key, d in (self.config.get("cost_limits") or {}).items()}
 
     @property
     def episode_length(self) -> int | None:

@@ -20,8 +20,9 @@ EVALUATION = {
 
 
 def change(run, **changes):
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    (run / "config.yaml").write_text(yaml.safe_dump({**config, **changes}))
+    config = yaml.safe_load((run / "config.yaml").read_text()) | changes
+    kept = {key: value for key, value in config.items() if value is not ...}
+    (run / "config.yaml").write_text(yaml.safe_dump(kept))
 
 
 def change_env(run, **changes):
@@ -78,10 +79,9 @@ UNUSUAL = {
     "braces": lambda run: change_env(run, name="{0.__class__} {{7*7}} {% raise %}"),
     "long key": lambda run: change_env(run, **{"k" * 9_000: 1}),
     "path": lambda run: change_env(run, name="../../../etc/passwd", robot_base="../../robot"),
-    "no name": lambda run: change(run, env={}),
-    "formula": lambda run: change(run, algo={"name": "=cmd()"}),
-    "init_from": lambda run: change(run, init_from="/etc"),
-    "no limits": lambda run: change(run, cost_limits=None),
+    "formula": lambda run: change(run, algo={"name": "=cmd()"}, cost_limits=None),
+    "no name": lambda run: change(run, env={}, init_from="/etc"),
+    "no limits": lambda run: change(run, cost_limits=...),
     "infinite": lambda run: table(run, HEAD + "\n1,1000,1,inf,inf,-inf,1\n2,2000,1,nan,1,1,2"),
     "nothing finished": lambda run: table(run, HEAD + "\n1,1000,0,,,,1\n2,2000,0,,,,2"),
     "NaN": lambda run: evaluate(run, json.dumps(EVALUATION).replace("2.0", "NaN")),
