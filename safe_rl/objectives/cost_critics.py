@@ -48,7 +48,7 @@ class CostCritics(QFunctionLoss):
         settings: Settings of the loss without costs.
 
     Raises:
-        ValueError: If the cost critic is no ensemble.
+        ValueError: If the cost critic is no ensemble, or there is not one multiplier per cost.
 
     Attributes:
         cost_unit: u, the typical size of one cost (`EpisodeCosts.unit`), [k]; 1 before `calibrate`.
@@ -82,6 +82,8 @@ class CostCritics(QFunctionLoss):
         device = next(cost_qvalue_network.parameters()).device
         check_ensemble(cost_qvalue_network, "cost critic")
         self.cost_keys = list(cost_keys)  # the base's constructor makes in_keys of them
+        if multiplier.num_costs != len(self.cost_keys):
+            raise ValueError(f"{multiplier.num_costs} multipliers for the costs {self.cost_keys}.")
         super().__init__(actor_network, qvalue_network, **settings)
         self.convert_to_functional(
             cost_qvalue_network, "cost_qvalue_network", create_target_params=True

@@ -224,12 +224,14 @@ def test_spans_may_have_a_dimension_of_their_own_as_in_torchrl(kind, shape):
     assert found["loss_cost_qvalue"] == losses["loss_cost_qvalue"]
 
 
-def test_a_critic_that_is_no_ensemble_is_refused():
+def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused():
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
-    actor = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8])
-    keys = {"multiplier": lagrange(1.0, 1.0), "cost_keys": COSTS, **SAC}
+    networks = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8]), make_q()
+    multiplier = lagrange(1.0, 1.0)
     with pytest.raises(ValueError, match=r"cost critic has to be a safe_rl.*, not a ValueOp"):
-        SACLagrangianLoss(actor, make_q(), critic, **keys)
+        SACLagrangianLoss(*networks, critic, multiplier=multiplier, cost_keys=COSTS, **SAC)
+    with pytest.raises(ValueError, match="2 multipliers for the costs"):
+        SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)
 
 
 def test_the_smoothing_of_td3_is_of_the_range_of_actions():
