@@ -50,7 +50,7 @@ def one_pass_values(
     if FIRST in in_keys:
         last = last.unsqueeze(-1)
     with set_recurrent_mode(True):
-        value = value_network(tensordict.select(*in_keys)).get(key)
+        value = require(value_network(tensordict.select(*in_keys)), key)
         value_at_ends = value_network(last).get(key)
     next_value = value.roll(-1, dims=-2)
     next_value[ends] = value_at_ends.reshape(-1, value.shape[-1])

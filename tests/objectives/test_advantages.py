@@ -111,21 +111,19 @@ def test_normalisation_of_a_constant_advantage_is_zero():
 
 
 def test_errors_say_what_to_change():
-    settings = {"gamma": 0.99, "lmbda": 0.97}
+    settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
     with pytest.raises(ValueError, match="lambda_return"):
-        VectorGAE(None, value_target="montecarlo", **settings)
-    cost = CostGAE(
-        ["cost_hazard"], make_critic("cost_value"), value_target="return_to_go", **settings
-    )
+        VectorGAE(None, **{**settings, "value_target": "montecarlo"})
+    cost = CostGAE(["cost_hazard"], make_critic("cost_value"), **settings)
     rollout = make_rollout([], costs=("cost_hazards", "cost_vases"))
     with pytest.raises(KeyError, match=r"Did you mean \('next', 'cost_hazards'\)"):
         cost(rollout)
     cost.set_keys(reward=["cost_hazards", "cost_vases"])
     with pytest.raises(ValueError, match="one output per signal"):
         cost(rollout)
-    reward = VectorGAE(None, value_target="lambda_return", **settings)
-    with pytest.raises(KeyError, match="state_value"):
-        reward(rollout)
+    for reward in (VectorGAE(make_critic("cost_value"), **settings), VectorGAE(None, **settings)):
+        with pytest.raises(KeyError, match=r"No entry .*state_value"):
+            reward(rollout)
     for keys in (["reward"], ["reward", "done", "terminated"]):  # the last dimension but one
         of_agents = rollout.clone()
         for key in keys:
