@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 from functools import cache
-from itertools import chain
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -50,17 +49,15 @@ def curves(algo: str) -> str:
 
 def draw_readme() -> None:
     """Draw what README shows."""
-    held = archived("holding_the_limit", "off_policy", steps=3_000_000)
+    held = archived("held_out")
     picture = save_figure(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
     # a third of the bytes: so many bands over one another have no more colours than fit a palette
     Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
 
 
-def archived(*campaigns: str, steps: int = 0) -> list[Experiment]:
-    """What campaigns in results/ have of runs of so many steps and more."""
-    results = ROOT / "results"
-    runs = chain.from_iterable(find_runs(results / campaign)[0] for campaign in campaigns)
-    return group_runs([run for run in runs if run.steps >= steps], suite())[0]
+def archived(campaign: str) -> list[Experiment]:
+    """Experiments of a campaign in results/."""
+    return group_runs(find_runs(ROOT / "results" / campaign)[0], suite())[0]
 
 
 def draw_columns(experiments: list[Experiment]) -> Figure:

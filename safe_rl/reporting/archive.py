@@ -137,7 +137,7 @@ def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
         >>> folder, table = getfixture("tmp_path"), {"steps": [1000.0, 2000.0]}
         >>> run = Run(folder / "a/seed0", {"model": {"width": 64}}, table, {"code": []})
         >>> write_archive({"a/seed0": run}, folder)
-        >>> read_archive(folder)["a/seed0"] == run
+        >>> read_archive(str(folder))["a/seed0"] == run
         True
     """
     pandas = import_extra("pandas", "report")
@@ -154,12 +154,13 @@ def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
             unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
-def read_archive(folder: Path) -> dict[str, Run]:
+def read_archive(folder: Path | str) -> dict[str, Run]:
     """Read the runs of an archive, by name, without checking them.
 
     Raises:
         ValueError: If the files are no archive.
     """
+    folder = Path(folder)
     try:
         entries = json.loads(gzip.decompress((folder / RUNS).read_bytes()))
         tables = dict(_tables(folder / ROWS))

@@ -23,9 +23,7 @@ def sentences(page):
     return " ".join(page.split())
 
 
-SEEDS = r"^\| (\w+) \| `(\w+)` \| ([34]\d\d(?:\W\d+)?) \| (.+) \|$"
 ONE_COMMIT = r"^\| (\w+) \| `(\w+)` \| (\d) \| (.+) \|$"
-HELD_OUT = re.findall(SEEDS, PAGE, re.MULTILINE)
 ENVIRONMENTS = ("PointGoal1", "CarGoal1")
 OFF_POLICY_ONES = ("cal", "sac_lagrangian", "td3_lagrangian")
 
@@ -89,15 +87,6 @@ def percent(share):
     return f"{share:.0%}".replace("%", " %")
 
 
-def three_million(env, algo, seeds):
-    """The runs of a row of the table, each of the campaign that has it."""
-    first, *others = map(int, re.findall(r"\d+", seeds))
-    numbers = range(first, (others or [first])[0] + 1)
-    campaigns = [RESULTS / name for name in ("holding_the_limit", "off_policy")]
-    paths = [[c / env / algo / f"seed{number}" for c in campaigns] for number in numbers]
-    return [next(filter(run_at, candidates)) for candidates in paths]
-
-
 def cells_of(folders):
     """A row of the table of three million steps."""
     of_runs = np.array([last(folder, 1 / 6) for folder in folders])
@@ -108,9 +97,10 @@ def cells_of(folders):
     return [" / ".join(final), f"{mean_cost:.1f}", percent(above), kept(folders)]
 
 
-@pytest.mark.parametrize(("env", "algo", "seeds", "cells"), HELD_OUT)
-def test_the_table_of_three_million_steps_is_that_of_the_archive(env, algo, seeds, cells):
-    assert cells.split(" | ") == cells_of(three_million(env, algo, seeds))
+@pytest.mark.parametrize("env", ENVIRONMENTS)
+def test_older_runs_of_td3_lagrangian(env):
+    runs = [RESULTS / "off_policy" / env / "td3_lagrangian" / f"seed{n}" for n in (300, 301, 302)]
+    assert f"| {env} | `td3_lagrangian` | 300 to 302 | {' | '.join(cells_of(runs))} |" in PAGE
 
 
 @pytest.mark.parametrize("algo", OFF_POLICY_ONES)
@@ -213,6 +203,8 @@ def test_the_table_of_readme_is_a_part_of_the_full_ones():
 def new_episodes(folders):
     """Mean costs of certified policies in new episodes, and the highest end of their intervals."""
     runs = [run.notes for run in map(run_at, folders) if run.notes["certificate"]["certified"]]
+    if not runs:
+        return "none"
     tests = [test for notes in runs for test in notes["evaluations"]]
     assert [(t["checkpoint"], t["episodes"]) for t in tests] == [("certified", 2000)] * len(runs)
     costs = [test["estimates"]["episode_cost"] for test in tests]
@@ -228,7 +220,7 @@ def test_the_campaign_at_one_commit():
         assert int(count) == len(folders)
         new = new_episodes(folders)
         assert cells.split(" | ") == [*cells_of(folders), new]
-        highest.append(float(new.split()[-2]))
+        highest += map(float, re.findall(r"([\d.]+) \(", new))
     assert runs == len(everything)
     certified = sum(run.notes["certificate"]["certified"] for run in everything)
     assert f"{certified} of the {runs} runs are certified" in PAGE
@@ -254,7 +246,7 @@ def test_the_last_five_epochs_of_the_paper_preset():
 
 
 def test_how_many_runs_are_within_the_limit():
-    runs = [run for env, algo, seeds, _ in HELD_OUT for run in three_million(env, algo, seeds)]
+    runs = [RESULTS / "held_out" / path for path in campaign("held_out")]
     within = [(*held(run), last(run, 1 / 6)[1]) for run in runs]
     from_one_million, above, end = np.array(within).T
     kept_limits = sum(from_one_million <= 25), sum(end <= 25)
