@@ -153,8 +153,6 @@ def test_quarters_of_what_was_tried_on_hard_tasks():
 
 
 HARD = r"^\| (\w+) \| (\d+) \| (\d) million \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$"
-
-
 TESTED = {"PointGoal2": (1321, 2201, 4420), "PointPush1": (1321, 2201)}  # by new episodes
 
 
@@ -226,6 +224,10 @@ def test_the_campaign_at_one_commit():
     assert f"{certified} of the {runs} runs are certified" in PAGE
     assert f"certifies {certified} of {runs} runs" in sentences(README)
     assert f"mean costs of at most {max(highest)} in 2,000" in sentences(README)
+    for algo in ("ppo_lagrangian", "trpo_lagrangian", "cpo"):
+        told = kept([RESULTS / "held_out" / p for p in campaign("held_out") if f"/{algo}/" in p])
+        page = (ROOT / "docs" / "algorithms" / f"{algo}.md").read_text()
+        assert f"{told.partition(',')[0]} runs of" in sentences(page)
 
 
 def test_the_first_command_of_readme():

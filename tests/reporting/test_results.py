@@ -35,14 +35,15 @@ def test_every_run_can_be_reported_and_every_campaign_is_listed():
     assert len(files) <= 60
 
 
+def columns_of(run):
+    return [np.array(run.table[f]) for f in ("steps", "episode_return", "episode_cost")]
+
+
 @pytest.mark.parametrize(("run", "row"), ROWS)
 def test_the_figures_are_those_of_the_tables(run, row):
     campaign, found = next((c, runs[run]) for c, runs in RUNS.items() if run in runs)
     width = WIDTHS.get(campaign, 500_000)
-    columns = found.table
-    steps, returns, costs = (
-        np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
-    )
+    steps, returns, costs = columns_of(found)
     cells, above = re.fullmatch(r"(.*) \|\s+(\d+ %)", row).groups()
     means = [cell.strip() for cell in cells.split(" |") if cell.strip()]
     assert len(means) == np.ceil(steps[-1] / width)
@@ -57,10 +58,7 @@ def test_the_figures_are_those_of_the_tables(run, row):
 @pytest.mark.parametrize(("run", "row"), QUARTERS)
 def test_the_figures_under_other_limits_are_those_of_tables_and_certificates(run, row):
     found = RUNS["limits"][run]
-    columns = found.table
-    steps, returns, costs = (
-        np.array(columns[name]) for name in ("steps", "episode_return", "episode_cost")
-    )
+    steps, returns, costs = columns_of(found)
     *quarters, certificate = row.split(" | ")
     assert len(quarters) == 4
     for number, said in enumerate(quarters):
