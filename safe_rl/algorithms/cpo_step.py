@@ -27,8 +27,8 @@ class CPOStep(TRPOStep):
 
     With g the gradient of the loss, bᵢ those of the cost surrogates and cᵢ the constraint
     violations, the step solves the CPO problem by its dual (see `cpo_dual`). The line search
-    takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0), and,
-    unless the step is a recovery (cases 0 and 1), a loss that is not worse.
+    takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0). In cases
+    2 to 4, in which the policy keeps its limits, the loss must also not be worse.
 
     The violations are arguments of the call. They can be from any estimate of J_c: the mean over
     finished episodes, or, if a batch is shorter than its episodes, its cost rate times T̄.

@@ -260,7 +260,7 @@ class Run:
         return import_extra("pandas", "report").DataFrame(self.table)
 
     def plot(self) -> Figure:
-        """Its learning curves, a Matplotlib figure: return, costs and multipliers."""
+        """Its learning curves, a Matplotlib figure: return, costs, cost rates and multipliers."""
         config, length = self.config, self.env.max_episode_steps
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
         return learning_curves(self.table, dict(config.cost_limits), length, title)

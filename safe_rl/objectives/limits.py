@@ -136,7 +136,7 @@ class LimitTracker(Checked, Resumable):
         free_steps: Environment steps at the start during which costs have no effect.
         descent_steps: Environment steps, after free_steps, during which the limit falls to d.
         recovery: Share of d that is the target once J_c is above d, until J_c has reached it; 1 for
-            none. This is the hysteresis of the published C-TRPO and CPO with hysteresis.
+            none. C-TRPO has the same hysteresis as a part of its step.
         steps_per_decision: Environment steps per time step of a batch, which is one action.
         frames: Environment steps of the whole run.
         latest_end: Share of the run at which the descent ends at the latest. In a shorter run,
