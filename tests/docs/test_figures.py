@@ -15,6 +15,7 @@ RESULTS = ROOT / "results"
 README = (ROOT / "README.md").read_text()
 PAGE = (ROOT / "docs" / "results.md").read_text()
 ALGORITHMS = (ROOT / "docs" / "algorithms" / "index.md").read_text()
+HOLDING = (ROOT / "docs" / "algorithms" / "holding_the_limit.md").read_text()
 OFF_POLICY = (ROOT / "docs" / "off_policy.md").read_text()
 
 
@@ -256,6 +257,9 @@ def test_how_many_runs_are_within_the_limit():
     assert said.format(len(within), *kept_limits) in sentences(PAGE)
     shares = f"{100 * above.min():.0f} to {percent(above.max())}"
     assert f"In each run {shares} of the epochs" in sentences(PAGE)
+    ten = [held(run)[1] for run in runs if re.search("PointGoal1/(p|tr)po_lagr", str(run))]
+    shares = f"{100 * min(ten):.0f} to {percent(max(ten))}"
+    assert f", {shares} of the epochs from one million steps on" in sentences(HOLDING)
 
 
 def test_what_is_said_of_pushing():
