@@ -14,8 +14,6 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-_NEEDED: dict[Any, tuple[str, str]] = {}
-
 
 _PLUGINS = {
     "hydra/launcher=joblib": "sweep",
@@ -35,9 +33,6 @@ def require_extra(module: str, extra: str) -> None:
 
     Raises:
         ModuleNotFoundError: If it is not installed; the message says how to install it.
-
-    Examples:
-        >>> require_extra("json", extra="report")
     """
     package = module.partition(".")[0]
     if find_spec(package) is None:
@@ -68,33 +63,16 @@ def hint_of_plugin(choice: str) -> str:
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """Import a module that comes with one of the package's extras.
-
-    Args:
-        module: Name of the module.
-        extra: The extra that installs it.
-
-    Raises:
-        ModuleNotFoundError: If it is not installed; the message says how to install it.
-
-    Examples:
-        >>> import_extra("json", extra="report").dumps([1])
-        '[1]'
-    """
+    """Import a module that comes with one of the extras, after :func:`require_extra`."""
     require_extra(module, extra)
     return importlib.import_module(module)
 
 
 def needs_extra(module: str, extra: str) -> Callable[[T], T]:
-    """Mark a class or function as one that needs a package of an extra, for `check_extra`.
-
-    Args:
-        module: Name of the package's module.
-        extra: The extra that installs it.
-    """
+    """Mark a class or function as one that needs a package of an extra, for `check_extra`."""
 
     def note(part: T) -> T:
-        _NEEDED[part] = (module, extra)
+        part.needed_extra = (module, extra)  # type: ignore[attr-defined]
         return part
 
     return note
@@ -105,10 +83,6 @@ def check_extra(part: Any) -> None:
 
     Raises:
         ModuleNotFoundError: If it is not installed; the message says how to install it.
-
-    Examples:
-        >>> check_extra(needs_extra("json", extra="report")(Any))
     """
-    for owner in getattr(part, "__mro__", (part,)):
-        if owner in _NEEDED:
-            require_extra(*_NEEDED[owner])
+    if needed := getattr(part, "needed_extra", None):
+        require_extra(*needed)
