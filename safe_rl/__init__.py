@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 __all__ = ["Run", "evaluate", "load", "make_env", "report", "resume", "train"]
 __version__ = "0.1.0"
 
-
 __getattr__, __dir__ = import_later(
-    __name__, dict.fromkeys(__all__, "safe_rl.cli.python_api") | {"make_env": "safe_rl.envs"}
+    __name__,
+    {
+        "cli.python_api": ["Run", "evaluate", "load", "report", "resume", "train"],
+        "envs": ["make_env"],
+    },
 )

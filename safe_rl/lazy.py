@@ -7,7 +7,7 @@ torch, TorchRL and MuJoCo, which take seconds to import.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -15,33 +15,34 @@ __all__ = ["import_later"]
 
 
 def import_later(
-    package: str, homes: Mapping[str, str]
+    package: str, homes: Mapping[str, Sequence[str]]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return a package's ``__getattr__``, which imports names, and ``__dir__``, which lists them.
 
     Args:
         package: Name of the package.
-        homes: Name -> the module that defines it.
+        homes: Module, named from the package -> names that it defines.
 
     Examples:
-        >>> find, names = import_later("safe_rl.lazy", {"sqrt": "math"})
-        >>> find("sqrt")(9.0)
-        3.0
-        >>> "sqrt" in names()
+        >>> find, names = import_later("safe_rl", {"naming": ["nearest"]})
+        >>> find("nearest")("cop", ["cpo"])
+        'cpo'
+        >>> "nearest" in names()
         True
         >>> find("root")
         Traceback (most recent call last):
-        AttributeError: module 'safe_rl.lazy' has no attribute 'root'
+        AttributeError: module 'safe_rl' has no attribute 'root'
     """
+    modules = {name: f"{package}.{home}" for home, names in homes.items() for name in names}
 
     def find(name: str) -> Any:
-        if name not in homes:
+        if name not in modules:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(import_module(homes[name]), name)
+        return getattr(import_module(modules[name]), name)
 
     def names() -> list[str]:
         own = vars(sys.modules[package])
         special = {name for name in own if name.startswith("__")}
-        return sorted({*special, *own.get("__all__", ()), *homes})
+        return sorted({*special, *own.get("__all__", ()), *modules})
 
     return find, names

@@ -49,14 +49,11 @@ __all__ = [
 __getattr__, __dir__ = import_later(
     __name__,
     {
-        "ConstrainedEnv": "safe_rl.envs.contract",
-        "ContractError": "safe_rl.envs.contract",
-        "LayoutError": "safe_rl.envs.safety_gym.layouts",
-        "SafetyGymEnv": "safe_rl.envs.safety_gym.env",
-        "check_constrained_env": "safe_rl.envs.contract",
-        "from_gymnasium": "safe_rl.envs.gymnasium.conversion",
-        "from_six_values": "safe_rl.envs.gymnasium.conversion",
-        "make_env": "safe_rl.envs.making",
+        "contract": ["ConstrainedEnv", "ContractError", "check_constrained_env"],
+        "gymnasium.conversion": ["from_gymnasium", "from_six_values"],
+        "making": ["make_env"],
+        "safety_gym.env": ["SafetyGymEnv"],
+        "safety_gym.layouts": ["LayoutError"],
     },
 )
 

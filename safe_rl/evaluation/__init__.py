@@ -22,11 +22,11 @@ __all__ = [
     "summarise",
 ]
 
-_HOMES = {
-    "certifying": ("Certificate", "certify"),
-    "episodes": ("Episodes", "collect_episodes"),
-    "measuring": ("Evaluation", "evaluate", "summarise"),
-}
 __getattr__, __dir__ = import_later(
-    __name__, {name: f"{__name__}.{home}" for home, names in _HOMES.items() for name in names}
+    __name__,
+    {
+        "certifying": ["Certificate", "certify"],
+        "episodes": ["Episodes", "collect_episodes"],
+        "measuring": ["Evaluation", "evaluate", "summarise"],
+    },
 )

@@ -14,6 +14,4 @@ if TYPE_CHECKING:
 
 __all__ = ["make_gymnasium", "make_safety_gymnasium"]
 
-__getattr__, __dir__ = import_later(
-    __name__, dict.fromkeys(__all__, "safe_rl.envs.gymnasium.conversion")
-)
+__getattr__, __dir__ = import_later(__name__, {"conversion": __all__})

@@ -9,4 +9,4 @@ if TYPE_CHECKING:
 
 __all__ = ["make_torchrl"]
 
-__getattr__, __dir__ = import_later(__name__, {"make_torchrl": "safe_rl.envs.torchrl.torchrl_env"})
+__getattr__, __dir__ = import_later(__name__, {"torchrl_env": __all__})

@@ -10,4 +10,4 @@ if TYPE_CHECKING:
 
 __all__ = ["VELOCITY_SUITE", "VelocityConfig", "VelocityEnv", "resolve_velocity"]
 
-__getattr__, __dir__ = import_later(__name__, {"VelocityEnv": "safe_rl.envs.velocity.velocity_env"})
+__getattr__, __dir__ = import_later(__name__, {"velocity_env": ["VelocityEnv"]})
