@@ -25,7 +25,7 @@ from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings, plain
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
-from safe_rl.evaluation.episodes import PeriodicEvaluation, default_seed, has_fixed_layout
+from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
@@ -211,7 +211,7 @@ class Session:
         evaluation, periodic = None, config.get("evaluation")
         if periodic is not None:
             evaluation = partial(
-                PeriodicEvaluation,
+                periodic_evaluation,
                 partial(make, evaluating=True),
                 cost_keys=training.cost_keys,
                 seed=default_seed(env, config.seed),

@@ -20,11 +20,11 @@ from safe_rl.naming import STEPS_TAKEN
 
 __all__ = [
     "Episodes",
-    "PeriodicEvaluation",
     "collect_episodes",
     "default_seed",
     "exploration",
     "has_fixed_layout",
+    "periodic_evaluation",
     "shared_layouts",
 ]
 
@@ -172,11 +172,22 @@ def shared_layouts(
 _MOST_WORLDS = 50
 
 
-class PeriodicEvaluation:
-    """Runs whole episodes of the policy, without exploration, at regular intervals.
+def periodic_evaluation(
+    make_env: Callable[..., EnvBase],
+    policy: TensorDictModuleBase,
+    cost_keys: Sequence[str],
+    *,
+    interval: int,
+    episodes: int,
+    seed: int,
+    fixed_layout: bool,
+) -> Callable[[int, int], dict[str, float]]:
+    """A function that runs whole episodes of the policy, without exploration, at regular intervals.
 
-    The worlds of an evaluation depend only on the seed and the number of steps. So an evaluation
-    does not change the random draws of training, and does not depend on interruptions.
+    It takes the numbers of steps before and after an epoch, and returns means over episodes if an
+    evaluation is due between them, else NaN. The worlds of an evaluation depend only on the seed
+    and the number of steps. So an evaluation does not change the random draws of training, and does
+    not depend on interruptions.
 
     Args:
         make_env: ``make_env(num_envs=, seed=)`` makes environments like the run's.
@@ -187,59 +198,24 @@ class PeriodicEvaluation:
         seed: Seed of the worlds, to which the steps of training are added, and of the policy's
             actions.
         fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
-
-    Examples:
-        >>> from safe_rl.envs import make_env
-        >>> from safe_rl.models import BehaviourPolicy, make_actor
-        >>> def make(**keys):
-        ...     return make_env({"robot_base": "point", "num_steps": 5}, **keys)
-        >>> size = make(num_envs=1, seed=0).observation_spec["observation"].shape[-1]
-        >>> policy = BehaviourPolicy(make_actor(size, 2, hidden_sizes=[8], initial_log_std=-0.5))
-        >>> evaluate = PeriodicEvaluation(
-        ...     make, policy, ["cost"], interval=100, episodes=2, seed=1, fixed_layout=False
-        ... )
-        >>> evaluate(50, 90)
-        {'evaluation_return': nan, 'evaluation_cost': nan}
-        >>> evaluate(90, 130)["evaluation_cost"]
-        0.0
     """
+    names = [f"evaluation_{name}" for name in ("return", *cost_keys)]
 
-    def __init__(
-        self,
-        make_env: Callable[..., EnvBase],
-        policy: TensorDictModuleBase,
-        cost_keys: Sequence[str],
-        *,
-        interval: int,
-        episodes: int,
-        seed: int,
-        fixed_layout: bool,
-    ) -> None:
-        self._make_env, self._policy, self._cost_keys = make_env, policy, list(cost_keys)
-        self._interval, self._episodes, self._seed = interval, episodes, seed
-        self._fixed_layout = fixed_layout
-
-    def __call__(self, before: int, after: int) -> dict[str, float]:
-        """Means over episodes if an evaluation is due between two numbers of steps, else NaN."""
-        names = ["return", *self._cost_keys]
-        if before // self._interval == after // self._interval:
-            return {f"evaluation_{name}": math.nan for name in names}
+    def evaluate(before: int, after: int) -> dict[str, float]:
+        if before // interval == after // interval:
+            return dict.fromkeys(names, math.nan)
+        fresh = (seed + after) % 2**62
+        devices = {parameter.device for parameter in policy.parameters() if parameter.is_cuda}
         # new environments every time, because some keep a part of their state after a new seed
-        worlds = min(self._episodes, _MOST_WORLDS)
-        fresh = (self._seed + after) % 2**62
-        seed = self._seed if self._fixed_layout else fresh
-        devices = {parameter.device for parameter in self._policy.parameters() if parameter.is_cuda}
+        worlds = min(episodes, _MOST_WORLDS)
         with (
             # before environments are made and seeded, which may draw from torch's generator
             torch.random.fork_rng(devices=devices),
-            closing(self._make_env(num_envs=worlds, seed=seed)) as env,
+            closing(make_env(num_envs=worlds, seed=seed if fixed_layout else fresh)) as env,
         ):
             torch.manual_seed(fresh)
-            found = collect_episodes(
-                env, self._policy, self._episodes, self._cost_keys, deterministic=True
-            )
-        values = [found.returns, *(found.costs[key] for key in self._cost_keys)]
-        return {
-            f"evaluation_{name}": value.mean().item()
-            for name, value in zip(names, values, strict=True)
-        }
+            found = collect_episodes(env, policy, episodes, cost_keys, deterministic=True)
+        means = (values.mean().item() for values in (found.returns, *found.costs.values()))
+        return dict(zip(names, means, strict=True))
+
+    return evaluate

@@ -15,9 +15,9 @@ from safe_rl.envs import ConstrainedEnv
 from safe_rl.envs.transforms import RewardScale, transform_env
 from safe_rl.evaluation import video
 from safe_rl.evaluation.episodes import (
-    PeriodicEvaluation,
     collect_episodes,
     default_seed,
+    periodic_evaluation,
     shared_layouts,
 )
 from safe_rl.evaluation.video import FORMATS, check_camera, record_episode
@@ -209,7 +209,7 @@ def test_layouts_without_a_range_are_known_where_they_are_fixed_and_the_seed_is_
 def make_evaluation(make, device="cpu", **keys):
     actor = make_actor(1, 1, hidden_sizes=[4], initial_log_std=-0.5, device=device)
     policy = BehaviourPolicy(actor)
-    return PeriodicEvaluation(make, policy, ["cost"], interval=100, episodes=3, seed=7, **keys)
+    return periodic_evaluation(make, policy, ["cost"], interval=100, episodes=3, seed=7, **keys)
 
 
 @pytest.mark.parametrize(("fixed", "seeds"), [(True, [7, 7]), (False, [107, 207])])

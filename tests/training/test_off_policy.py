@@ -10,7 +10,7 @@ from run_configs import assert_resumes_exactly, off_policy_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
-from safe_rl.evaluation.episodes import PeriodicEvaluation, collect_episodes
+from safe_rl.evaluation.episodes import collect_episodes, periodic_evaluation
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.objectives import SACLagrangianLoss
 from safe_rl.runs.table import read_table
@@ -208,7 +208,7 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
         evaluation = None
         if interval:
             evaluation = partial(
-                PeriodicEvaluation, partial(PointMass, num_steps=20),
+                periodic_evaluation, partial(PointMass, num_steps=20),
                 cost_keys=["cost"], interval=interval, episodes=6, seed=5, fixed_layout=False,
             )  # fmt: skip
         env = PointMass(4, 20)
