@@ -101,11 +101,7 @@ def resolving(config: DictConfig) -> Iterator[None]:
 
 
 def search_folders(folders: Iterable[str | Path]) -> list[str]:
-    """Return the override that adds folders to Hydra's search path; an empty list without folders.
-
-    Raises:
-        CommandLineError: If a folder does not exist.
-    """
+    """The override that adds existing folders to Hydra's search path; none without folders."""
     paths = [Path(folder).expanduser().absolute() for folder in folders]
     if missing := next((path for path in paths if not path.is_dir()), None):
         raise CommandLineError(f"config_dir={missing}: there is no such folder.")
@@ -229,11 +225,7 @@ def _check_top(config: DictConfig) -> None:
 
 
 def check_risk(config: DictConfig) -> None:
-    """Refuse a risk measure where costs have no limit.
-
-    Raises:
-        CommandLineError: If neither the algorithm nor a transform would use it.
-    """
+    """Refuse a risk measure that neither the algorithm nor a transform would use."""
     measure = (config.get("risk") or {}).get("_target_")
     is_constrained = config.algo.get("constrained") is not False
     if measure is not None and not is_to_keep_limits(config, is_constrained):

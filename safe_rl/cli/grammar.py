@@ -41,15 +41,7 @@ class CommandLineError(ValueError):
 
 
 def parse(text: str) -> Override:
-    """Read one override.
-
-    Raises:
-        CommandLineError: If the text is no override.
-
-    Examples:
-        >>> parse("env.hazards_num=3").value()
-        3
-    """
+    """Read one override; a `CommandLineError` says why a text is none."""
     try:
         return OverridesParser.create().parse_override(text)
     except HydraException as error:
@@ -78,16 +70,10 @@ def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]]:
-    """Separate ``import=`` from the other arguments of a command line.
-
-    Args:
-        arguments: Arguments of a command; ``import=`` may be repeated, or hold a list.
+    """Separate ``import=``, which may be repeated or hold a list, from the other arguments.
 
     Returns:
         The modules, or None if ``import=`` is not given; and the other arguments.
-
-    Raises:
-        CommandLineError: If a list cannot be read.
 
     Examples:
         >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
@@ -144,11 +130,7 @@ def _written(value: Any) -> str:
 
 
 def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
-    """Read the options of a command.
-
-    Args:
-        arguments: Texts of the form ``key=value``; nested keys have dots.
-        schema: Dataclass with a default for every field.
+    """Read the options of a command, ``key=value``; nested keys have dots.
 
     Raises:
         CommandLineError: If an option is unknown (the message names the nearest one), has no value,
@@ -191,11 +173,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:
-    """Read options from keyword arguments, as :func:`parse_options` reads them from texts.
-
-    Raises:
-        CommandLineError: As for `parse_options`.
-    """
+    """Read options from keyword arguments, as :func:`parse_options` reads them from texts."""
     return parse_options(list(overrides_of(given, ["variations"])), schema)
 
 
