@@ -51,25 +51,11 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITH_EXPONENT, [*"-+01
 
 
 def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """Read a regular file of bounded size.
-
-    Args:
-        path: The file.
-        most: Largest size to read, bytes.
+    """Read a regular file of at most ``most`` bytes.
 
     Raises:
         ValueError: If it is larger, or no regular file: reading a pipe could wait for ever.
         OSError: If it cannot be read.
-
-    Examples:
-        >>> path = getfixture("tmp_path") / "note.txt"
-        >>> _ = path.write_text("abc")
-        >>> read_bounded(path)
-        b'abc'
-        >>> read_bounded(path, most=2)
-        Traceback (most recent call last):
-        ...
-        ValueError: note.txt has more than 2 bytes
     """
     if not path.is_file() and path.exists():
         raise ValueError(f"{path.name} is no regular file")
@@ -135,8 +121,7 @@ def read_config(path: Path) -> dict[str, Any]:
         OSError: If it cannot be read.
 
     Examples:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "config.yaml"
+        >>> path = getfixture("tmp_path") / "config.yaml"
         >>> _ = path.write_text("seed: 3\nmodel: {hidden_sizes: [64, 64]}")
         >>> read_config(path)
         {'seed': 3, 'model': {'hidden_sizes': [64, 64]}}
@@ -165,14 +150,6 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield the path of a new file to write, which replaces ``path`` at the end of the block.
 
     Readers see the old or the new content, also after an interruption.
-
-    Examples:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "numbers.csv"
-        >>> with replacing(path) as unfinished:
-        ...     _ = unfinished.write_text("1,2")
-        >>> path.read_text()
-        '1,2'
     """
     unfinished = path.with_name(f".{path.stem}.{secrets.token_hex(8)}{path.suffix}")
     # must be a new file: a prepared link could lead to another file
@@ -212,11 +189,7 @@ def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors, numbers, texts and plain containers by `torch.save` and :func:`replacing`.
-
-    Raises:
-        OSError: If they cannot be written.
-    """
+    """Write tensors, numbers, texts and plain containers by `torch.save` and :func:`replacing`."""
     import torch  # imported here: help and configurations are shown without torch
 
     try:

@@ -47,15 +47,7 @@ class Parameter(NamedTuple):
     is_described: bool = True
 
     def check(self, path: str, value: Any) -> None:
-        """Refuse a value that the argument cannot have.
-
-        Args:
-            path: Full key, for the message.
-            value: The value, as a YAML file has it.
-
-        Raises:
-            SettingError: If the argument cannot have the value.
-        """
+        """Refuse a value that the argument cannot have; ``path`` is the full key."""
         if not self.values.hold(value):
             meaning = f" ({self.meaning})" if self.meaning else ""
             raise SettingError(f"{path}={_shown(value)}: it must be {self.values.words}{meaning}.")

@@ -93,10 +93,6 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
 def locate(target: Any, key: str = "") -> Callable[..., Any]:
     """Return the class or function of a dotted name, if a configuration may name it.
 
-    Args:
-        target: The name.
-        key: Key of the target, for the message.
-
     Raises:
         TargetError: If it may not be named, or does not exist.
 

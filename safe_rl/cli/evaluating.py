@@ -48,16 +48,7 @@ def evaluate_run(
 def certify_run(
     directory: Path, *, num_threads: int = 0, changes: Mapping[str, Any] | None = None
 ) -> Certificate | None:
-    """:func:`safe_rl.evaluation.certify` with the options of the run's own configuration.
-
-    Args:
-        directory: Folder of the run.
-        num_threads: Threads that step environments; 0 is one per core.
-        changes: Options to replace, such as ``{"episodes": 2000}``.
-
-    Raises:
-        ValueError: If an option does not exist, or cannot have its value.
-    """
+    """:func:`safe_rl.evaluation.certify` with the options of the run, some of them changed."""
     options = certificate_options(load_config(directory), changes)
     make = maker_of(directory)
     certificate = certify(directory, options, make_env=make, num_threads=num_threads, progress=True)

@@ -25,12 +25,7 @@ FORMATS = ("png", "svg", "pdf")
 
 @dataclass
 class ReportOptions:
-    """Options of ``python -m safe_rl.report``; their help texts describe them.
-
-    Examples:
-        >>> ReportOptions(seeds=5).unfinished
-        False
-    """
+    """Options of ``python -m safe_rl.report``; their help texts describe them."""
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
     seeds: int = option(len(SEEDS), "finished runs per environment that a slate needs")

@@ -31,9 +31,6 @@ def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
 
     If a folder of that name exists, for example of a run that began in the same second, a number is
     added to the name. A folder that the command line names is used as it is.
-
-    Raises:
-        OSError: If the folder cannot be made.
     """
     wanted = Path(os.path.abspath(Path(hydra.run.dir).expanduser()))
     if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
@@ -50,9 +47,6 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     """Note which custom robot a run begins with, and copy its files.
 
     If the files cannot be copied, the note has their hash only, and the reason is printed.
-
-    Raises:
-        OSError: If a file cannot be written.
     """
     robot = _own_robot(env)
     if robot is None:

@@ -51,12 +51,7 @@ def option(default: Any, help: str) -> Any:
 
 @dataclass
 class EvaluationOptions:
-    """Options of ``python -m safe_rl.evaluate``; the help texts say what they mean.
-
-    Examples:
-        >>> EvaluationOptions(episodes=10, env={"hazards_num": 12}).checkpoint
-        'last'
-    """
+    """Options of ``python -m safe_rl.evaluate``; the help texts say what they mean."""
 
     episodes: Annotated[int, Range(1, 10**8)] = option(100, "whole episodes to run")
     checkpoint: str = option(

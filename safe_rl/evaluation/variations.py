@@ -222,18 +222,8 @@ def evaluate_variations(
     """Run a trained policy in its own environment and under ``options.variations``.
 
     All environments have the same seed, so that differences between them are less due to chance.
-
-    Args:
-        directory: Folder of a run.
-        options: Options of the evaluation; ``env`` changes all of the environments.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
-        progress: Whether to print the name of the next variation.
-
-    Raises:
-        FileNotFoundError: If the folder is not a run's, or has no such checkpoint.
-        OSError: If results cannot be written, which is checked before any episode.
-        CheckpointError: If the policy does not fit a varied environment.
-        ValueError: If variations do not exist, or an environment cannot have them.
+    Arguments and errors are those of :func:`safe_rl.evaluation.evaluate`; ``options.env`` changes
+    all environments.
     """
     check_options(options)
     variations = read_variations(options.variations)
