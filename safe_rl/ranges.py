@@ -18,7 +18,8 @@ from typing import get_origin as origin_of
 
 __all__ = [
     *("ANYTHING", "PART", "Checked", "Count", "Fraction", "NotNegative", "Number", "Options"),
-    *("Positive", "Range", "Share", "Text", "Values", "Weight", "is_described", "values_of"),
+    *("Positive", "Range", "Share", "Text", "Values", "Weight", "is_described", "is_number"),
+    *("is_text", "values_of"),
 ]
 
 
@@ -150,36 +151,30 @@ def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
         if isinstance(item, Values):
             return item
         if isinstance(item, Range):
-            return _whole(item) if kind is int else _number(item)
+            return _within(item, whole=kind is int)
     return values_of(kind)
 
 
-def _number(range: Range) -> Values:
-    lowest = -1e9 if range.low is None else range.low
-    # float32 can hold its square
-    highest = 1e9 if range.high is None else range.high
-    low = f"above {lowest:g}" if range.above else f"from {lowest:g}"
-    high = f"{'at most' if range.above else 'to'} {highest:g}"
-    if range.below:
-        high = f"below {highest:g}"
+def _within(range: Range, *, whole: bool) -> Values:
+    most = 10**15 if whole else 1e9  # float32 can hold the square of 1e9
+    lowest = -most if range.low is None else range.low
+    highest = most if range.high is None else range.high
 
     def hold(value: Any) -> bool:
         if not is_number(value) or not lowest <= value <= highest:
             return False
+        if whole and value != int(value):
+            return False
         return not (range.above and value == lowest) and not (range.below and value == highest)
 
+    if whole:
+        return Values(hold, f"a whole number from {lowest} to {highest:,}", whole=True)
+    low = f"above {lowest:g}" if range.above else f"from {lowest:g}"
+    high = f"{'at most' if range.above else 'to'} {highest:g}"
+    if range.below:
+        high = f"below {highest:g}"
     join = " and " if range.above or range.below else " "
     return Values(hold, f"a number {low}{join}{high}")
-
-
-def _whole(range: Range) -> Values:
-    lowest = -(10**15) if range.low is None else int(range.low)
-    highest = 10**15 if range.high is None else int(range.high)
-
-    def hold(value: Any) -> bool:
-        return is_number(value) and lowest <= value <= highest and value == int(value)
-
-    return Values(hold, f"a whole number from {lowest} to {highest:,}", whole=True)
 
 
 def _choice(names: Sequence[Any]) -> Values:
@@ -213,7 +208,7 @@ def _mapping(item: Values) -> Values:
 
 _PLAIN: dict[Any, Values] = {
     **{bool: _BOOLEAN, str: _TEXT, None: _NULL, NoneType: _NULL},
-    **{int: _whole(Range()), float: _number(Range())},
+    **{kind: _within(Range(), whole=kind is int) for kind in (int, float)},
 }
 
 
