@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -14,6 +13,7 @@ from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import Charges, RiskMeasure
+from safe_rl.ranges import is_number
 from safe_rl.resumable import Resumable
 
 __all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
@@ -172,8 +172,7 @@ def check_cost_limits(
                 f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}; in Safety "
                 "Gym's environments env.constrain_<kind>=true adds those of another kind."
             )
-        is_number = isinstance(limit, int | float) and not isinstance(limit, bool)
-        if not is_number or not 0 <= limit < math.inf:
+        if not is_number(limit) or limit < 0:
             raise ValueError(
                 f"The limit of '{key}' is {limit!r}: it must be a number of at least 0, the "
                 "undiscounted cost allowed per episode. Leave out a cost that has no limit."

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_rl.ranges import is_number
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
@@ -49,8 +50,8 @@ class Run:
             "env": isinstance(self.config.get("env"), dict),
             "algo": isinstance(select(self.config, "algo", "name"), str),
             "seed": type(self.config.get("seed")) is int,
-            "frames": _is_number(frames) and frames >= 0,
-            "cost_limits": isinstance(limits, dict) and all(map(_is_number, limits.values())),
+            "frames": is_number(frames) and frames >= 0,
+            "cost_limits": isinstance(limits, dict) and all(map(is_number, limits.values())),
             "init_from": isinstance(self.config.get("init_from"), str | None),
         }
         if wrong := ", ".join(key for key, is_usable in usable.items() if not is_usable):
@@ -219,7 +220,3 @@ def select(node: Any, *keys: str) -> Any:
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
