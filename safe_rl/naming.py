@@ -34,12 +34,8 @@ def join_keys(above: str, name: str) -> str:
 def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:
     """Return the known name that is most similar to `name`, or None if none is similar.
 
-    Capitals are ignored, and hyphens count as underscores.
-
-    Args:
-        name: The wrong name.
-        known: The right names.
-        likeness: Smallest ratio of difflib's SequenceMatcher at which two names are similar.
+    Names are similar from a ratio `likeness` of difflib's SequenceMatcher on. Capitals are ignored,
+    and hyphens count as underscores.
 
     Examples:
         >>> nearest("hazard_num", ["hazards_num", "vases_num"])

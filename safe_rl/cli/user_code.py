@@ -95,16 +95,7 @@ def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **optio
 
 
 def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:
-    """Refuse to open a run that has used modules of its own, unless ``import=`` is given.
-
-    Args:
-        config: Configuration of the run.
-        given: Modules of the command line; None if there is no ``import=``.
-        run: Folder of the run, for the message.
-
-    Raises:
-        CommandLineError: If the run has used modules and ``given`` is None.
-    """
+    """Refuse to open a run that has used modules of its own, unless ``import=`` is given."""
     noted = config.get(IMPORT) or []
     if given is None and noted:
         words = " ".join(f"{IMPORT}={module}" for module in noted)

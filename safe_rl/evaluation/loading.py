@@ -89,11 +89,7 @@ def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Call
 
 
 def find_checkpoint(directory: Path, which: str) -> Path:
-    """Return the path of a run's checkpoint.
-
-    Args:
-        directory: Folder of the run.
-        which: "last", "best", "certified", or a path.
+    """Return the path of a run's checkpoint: "last", "best", "certified", or a path.
 
     Raises:
         FileNotFoundError: If there is none; the message says why and what there is.
