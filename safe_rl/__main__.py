@@ -8,8 +8,6 @@ from importlib import import_module
 
 from safe_rl.naming import did_you_mean
 
-__all__ = ["main"]
-
 COMMANDS = {
     "train": "train an algorithm on an environment, as python train.py does",
     "evaluate": "measure a trained policy on whole episodes",

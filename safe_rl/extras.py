@@ -8,11 +8,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = [
-    *("check_extra", "hint_of_plugin", "import_extra", "installing", "needs_extra"),
-    "require_extra",
-]
-
 T = TypeVar("T")
 
 _PLUGINS = {

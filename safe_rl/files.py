@@ -19,12 +19,6 @@ from zipfile import ZipFile
 
 import yaml
 
-__all__ = [
-    *("CONF", "check_no_links", "check_place", "load_tensors", "read_bounded", "read_config"),
-    *("read_json", "read_yaml", "replace_csv", "replace_json", "replace_text", "replacing"),
-    "save_tensors",
-]
-
 _PACKAGED = Path(__file__).parent / "conf"
 CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[1] / "conf"
 """Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from difflib import SequenceMatcher
 from typing import Any
 
-__all__ = ["STEPS_TAKEN", "did_you_mean", "join_keys", "key_name", "nearest"]
-
 STEPS_TAKEN = "steps_taken"
 """Key below "next": the number of environment steps that an action was held for, [..., 1]."""
 

@@ -13,8 +13,6 @@ from safe_rl.extras import check_extra
 from safe_rl.ranges import NotNegative, Range, Values, Weight, is_described, values_of
 from safe_rl.targets import locate
 
-__all__ = ["Parameter", "Part", "SettingError", "accepted_names", "parameters_of", "read_part"]
-
 
 class SettingError(ValueError):
     """A value that a run cannot have; the message names the key."""

@@ -13,8 +13,6 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from threading import Thread
 
-__all__ = ["end_with_parent", "leave_signals_to_parent", "starting_processes"]
-
 _LOOK = 1.0
 """Seconds between checks of the parent."""
 _watching: set[int] = set()  # ids of this process and its ancestors that watch their parent

@@ -14,8 +14,6 @@ import warnings
 from functools import cache
 from pathlib import Path
 
-__all__ = ["cpuinfo"]
-
 _FILE = Path("/proc/cpuinfo")
 
 # GOMP_SPINCOUNT sets the same more finely

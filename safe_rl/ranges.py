@@ -16,12 +16,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Union
 from typing import get_args as arguments_of
 from typing import get_origin as origin_of
 
-__all__ = [
-    *("ANYTHING", "PART", "Checked", "Count", "Fraction", "NotNegative", "Number", "Options"),
-    *("Positive", "Range", "Share", "Text", "Values", "Weight", "is_described", "is_number"),
-    *("is_text", "values_of"),
-]
-
 
 class Values(NamedTuple):
     """A set of values; as metadata of `Annotated`, those that a parameter may have.

@@ -11,8 +11,6 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-__all__ = ["Resumable"]
-
 
 class Resumable:
     """Base class of objects that checkpoints save: it saves the attributes in ``state_names``.

@@ -18,8 +18,6 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from safe_rl.naming import did_you_mean, join_keys
 
-__all__ = ["TargetError", "allow", "build", "locate"]
-
 # Packages and modules with parts of a run, and those of the user. Names are listed where other
 # classes and functions start programs, import modules, or write and remove files; None: all may be
 # named.

@@ -33,11 +33,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.identity import flatten, role_of
 
-__all__ = [
-    *("check_risk", "compose_jobs", "compose_resumed", "hydra_on_conf", "is_to_keep_limits"),
-    *("resolving", "search_folders"),
-]
-
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
 _MISSING = object()

@@ -9,8 +9,6 @@ from safe_rl.cli.grammar import CommandLineError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
 
-__all__ = ["main"]
-
 
 def main(
     arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.evaluate"

@@ -27,8 +27,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["certificate_options", "certify_run", "evaluate_run", "evaluate_varied"]
-
 
 def evaluate_run(
     directory: Path, options: EvaluationOptions, *, progress: bool = False

@@ -11,8 +11,6 @@ from safe_rl.cli.grammar import run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import option
 
-__all__ = ["ExportOptions", "main"]
-
 
 @dataclass
 class ExportOptions:

@@ -23,11 +23,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.naming import did_you_mean
 
-__all__ = [
-    *("IMPORT", "CommandLineError", "overrides_of", "parse", "parse_options", "run_command"),
-    *("say_interruptions", "split_imports", "take_options", "take_word", "usage"),
-]
-
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 

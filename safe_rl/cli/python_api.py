@@ -42,8 +42,6 @@ from safe_rl.runs.table import read_table
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Run", "evaluate", "load", "report", "resume", "train"]
-
 Callback = Callable[[Mapping[str, float]], Any]
 # mappings that are given all at once
 _WHOLE = [*GIVEN_WHOLE, "env.outside", "env.kwargs", "env.cost", "memory.prioritised"]

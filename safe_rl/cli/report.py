@@ -18,8 +18,6 @@ from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
 from safe_rl.scores.benchmark import SEEDS, Suite
 
-__all__ = ["ReportOptions", "main", "report", "suite"]
-
 FORMATS = ("png", "svg", "pdf")
 
 

@@ -23,8 +23,6 @@ from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, ow
 from safe_rl.files import read_json, replace_text
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["keep_robot", "maker_of", "new_folder", "robot_of"]
-
 
 def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
     """Return the folder of a new run, and whether the folder is new as well.

@@ -31,10 +31,6 @@ from safe_rl.ranges import (
 )
 from safe_rl.runs.identity import flatten
 
-__all__ = [
-    *("GIVEN_WHOLE", "KEYS", "SettingError", "check_settings", "plain", "unknown_key", "unread_by"),
-]
-
 GIVEN_WHOLE = {
     **{"cost_limits": "limits", "model.input_scale": "factors"},
     **{f"transforms.{t}.budgets": "budgets" for t in ("saute", "simmer", "early_termination")},

@@ -36,8 +36,6 @@ from safe_rl.runs.table import TableError, read_table
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
 
-__all__ = ["SETTING_ERRORS", "Session", "run_job"]
-
 SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError, ModuleNotFoundError),
 )

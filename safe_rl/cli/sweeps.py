@@ -22,8 +22,6 @@ from safe_rl.processes import end_with_parent
 from safe_rl.runs.display import LINE_SECONDS
 from safe_rl.runs.folder import RunFolder, RunInUseError
 
-__all__ = ["Sweep", "count_jobs"]
-
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 

@@ -30,8 +30,6 @@ from safe_rl.cli.user_code import import_modules, note_imports
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES
 
-__all__ = ["Command", "expand_slate", "main", "read_command"]
-
 _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
     "--help -h": ("show environments, algorithms and all settings", {}),
     "--hydra-help": ("show these flags and Hydra's settings", {}),

@@ -17,8 +17,6 @@ from typing import Any
 from safe_rl import targets
 from safe_rl.cli.grammar import IMPORT, CommandLineError, overrides_of
 
-__all__ = ["check_imports", "import_modules", "imported", "make_after_imports", "note_imports"]
-
 _imported: list[str] = []
 
 

@@ -24,8 +24,6 @@ from safe_rl.files import check_no_links, replace_json, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
-__all__ = ["Certificate", "certify"]
-
 # number of environments that are stepped together, and of episodes between two checks of a test;
 # MuJoCo Warp takes nearly the same time for a thousand environments as for a hundred
 _BATCH, _BATCH_OF_WARP = 100, 1_000

@@ -18,16 +18,6 @@ from tqdm import tqdm
 
 from safe_rl.naming import STEPS_TAKEN
 
-__all__ = [
-    "Episodes",
-    "collect_episodes",
-    "default_seed",
-    "exploration",
-    "has_fixed_layout",
-    "periodic_evaluation",
-    "shared_layouts",
-]
-
 
 @dataclass(frozen=True)
 class Episodes:

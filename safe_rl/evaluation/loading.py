@@ -20,17 +20,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
 from safe_rl.runs.folder import KINDS, RunFolder
 
-__all__ = [
-    "check_env_keys",
-    "find_checkpoint",
-    "for_evaluation",
-    "limits_of",
-    "load_config",
-    "load_policy",
-    "override_env",
-    "transforms_of",
-]
-
 
 def load_config(directory: Path) -> DictConfig:
     """Read the resolved configuration of a run.

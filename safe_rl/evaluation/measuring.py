@@ -32,11 +32,6 @@ from safe_rl.scores.benchmark import Scores, Suite
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
 from safe_rl.scores.measures import normalise
 
-__all__ = [
-    *("Evaluation", "Trial", "check_places", "evaluate", "format_estimates", "format_unjudged"),
-    "summarise",
-]
-
 # keys of the choice of layouts: with other values it is still the same environment
 _LAYOUTS = ("layout_seeds", "layout_seeds_first")
 

@@ -23,8 +23,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
 
-__all__ = ["POLICIES", "export_onnx", "find_run", "pack_policy", "writable_copy"]
-
 POLICIES = Path(__file__).parents[1] / "policies"
 """A folder per environment, each with a configuration, a certificate and the policy's weights."""
 _PREFIX = "certified"

@@ -9,15 +9,6 @@ from typing import Annotated, Any, Literal
 from safe_rl.parameters import parameters_of
 from safe_rl.ranges import Fraction, NotNegative, Positive, Range, Share, Values
 
-__all__ = [
-    "PICTURES",
-    "CertificateOptions",
-    "Device",
-    "EvaluationOptions",
-    "check_options",
-    "option",
-]
-
 PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
 

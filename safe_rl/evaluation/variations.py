@@ -18,11 +18,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.runs.folder import RunFolder
 from safe_rl.scores.comparisons import Estimate
 
-__all__ = [
-    *("AS_TRAINED", "Varied", "VariedRow", "Variation", "evaluate_variations", "read_variations"),
-    "varied",
-]
-
 _FACTOR = "x"
 
 

@@ -19,15 +19,6 @@ from safe_rl.extras import import_extra
 from safe_rl.files import replacing
 from safe_rl.naming import STEPS_TAKEN
 
-__all__ = [
-    "FORMATS",
-    "VideoFormat",
-    "check_camera",
-    "record_episode",
-    "video_format",
-    "write_video",
-]
-
 
 class VideoFormat(NamedTuple):
     """Format in which an episode is recorded.

@@ -13,12 +13,6 @@ from typing import Any, NamedTuple
 
 import yaml
 
-__all__ = [
-    *("ALGORITHMS", "COST_LIMIT", "PUBLISHED", "PUBLISHED_STEPS", "REFERENCE"),
-    *("REIMPLEMENTATIONS", "REIMPLEMENTATION_STEPS", "SEEDS", "SLATES"),
-    *("Normalised", "Scores", "Suite"),
-]
-
 Node = Mapping[str, Any]
 
 

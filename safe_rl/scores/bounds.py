@@ -8,8 +8,6 @@ import numpy as np
 import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
-__all__ = ["best_growth", "betting_bound", "log_wealth", "student_bound"]
-
 # bets, as shares of the largest possible one, and the share of the first wealth for each. An
 # episode's highest cost is usually far above the limit, and then large bets are the best ones
 _BETS = np.array([0.99, 0.7, 0.4, 0.2, 0.08, 0.03])
