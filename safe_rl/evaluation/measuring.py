@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -217,9 +217,8 @@ def evaluate(
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
 
 
-def check_places(places: Iterable[Path]) -> None:
+def check_places(places: Collection[Path]) -> None:
     """Refuse files that cannot be written, before any episode."""
-    places = list(places)
     for folder in {place.parent for place in places}:
         check_no_links(folder)
     for place in places:
