@@ -48,6 +48,7 @@ def _int(low: int, high: int | None = None) -> Any:
 _ONE = "1, as collector=local is one process; for more use collector=process or collector=ray"
 _Width = Annotated[int, Range(1, 16_384)]
 _Widths = list[_Width]
+_LogStd = Annotated[float, Range(-20, 10)]
 _Limits = dict[str, NotNegative]
 _Part = Annotated[Any, PART]
 _Few = _int(0, 1000)
@@ -76,19 +77,13 @@ _ROWS: dict[str, tuple[Any, str]] = {
     "checkpoint.interval": (NotNegative, "seconds between checkpoints"),
     "checkpoint.keep_last": (_Kept, "number of last checkpoints that are kept besides the best"),
     "checkpoint.keep_best": (_Kept, "number of best checkpoints that are kept"),
-    "checkpoint.best_over": (
-        _Kept,
-        "epochs over which return and costs of candidates are averaged",
-    ),
+    "checkpoint.best_over": (_Kept, "number of epochs in the mean return and costs of a candidate"),
     "collector": (Options, "where environments are stepped: collector=local"),
     "collector.num_collectors": (Annotated[int, Values(lambda v: v == 1, _ONE)], "processes"),
     "logger": (Options, "logger in addition to progress.csv: logger=wandb, logger=none"),
     "model": (Options, "the networks"),
     "model.hidden_sizes": (_Widths, "widths of layers, such as [64, 64]"),
-    "model.initial_log_std": (
-        Annotated[float, Range(-20, 10)],
-        "log of the initial standard deviation of the policy",
-    ),
+    "model.initial_log_std": (_LogStd, "log of the policy's initial standard deviation"),
     "model.input_scale": (dict[str, Positive], "factors by observation component"),
     "model.encoders.vector": (_Widths, "widths of the layers of a vector's encoder"),
     "model.encoders.channels": (_Widths, "channels of convolutions for an image"),
@@ -116,10 +111,7 @@ _ROWS: dict[str, tuple[Any, str]] = {
     "paper": (Any, "numbers that preset=paper chooses from"),
     "replay": (Any, "off-policy defaults, which preset=default reads"),
     "transforms": (dict[str, _Part], "changes of the problem: transforms=[saute]"),
-    "staggered_starts": (
-        bool | None,
-        "whether environments start at different steps of an episode",
-    ),
+    "staggered_starts": (bool | None, "whether environments begin at different steps of episodes"),
     "certificate": (Options, "the test at a run's end; certificate.episodes=0 for none"),
     "advantage": (_Part, "estimator of the reward's advantages"),
     "cost_advantage": (_Part | None, "estimator of the costs' advantages"),
