@@ -82,9 +82,6 @@ def evaluate_varied(
 
     Returns:
         The results, and the path of the picture.
-
-    Raises:
-        ValueError: If there are no such variations, or the environment cannot have them.
     """
     directory = writable_copy(directory)
     make = maker_of(directory)

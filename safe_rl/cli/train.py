@@ -151,10 +151,6 @@ def _parser() -> ArgumentParser:
 def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
     """Replace ``slate=SG6`` by the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
 
-    Raises:
-        CommandLineError: If there is no such slate, or it has several environments and the command
-            is no sweep.
-
     Examples:
         >>> expand_slate(["slate=SGDoggo", "seed=0"], is_sweep=True)[0]
         'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'

@@ -31,9 +31,6 @@ _PREFIX = "certified"
 def find_run(name: str | Path) -> Path:
     """The folder of a run, or of one of the package's policies: ``certified/PointGoal1``.
 
-    Raises:
-        FileNotFoundError: If the package has no such policy.
-
     Examples:
         >>> find_run("runs/mine").as_posix()
         'runs/mine'
