@@ -75,6 +75,7 @@ def test_torchrls_notes_are_kept_off_the_terminal_but_not_its_warnings(command, 
     monkeypatch.delenv("RL_LOGGING_LEVEL", raising=False)
     logger = logging.getLogger("torchrl")
     monkeypatch.setattr(logger, "handlers", [kept := logging.handlers.BufferingHandler(9)])
+    monkeypatch.setattr(logger, "disabled", False)  # as import-linter leaves it
     logger.setLevel(logging.INFO)
     status, *_ = command(*SMALL, "frames=40", "algo=sac", "hydra.run.dir=runs/quiet")
     logger.warning("of something that is wrong")
