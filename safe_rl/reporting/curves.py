@@ -143,20 +143,21 @@ def draw_small_multiples(
     for kind, title in enumerate(_TITLES):
         finals = [c.mean[-1] for found in means.values() if (c := found[kind]) is not None]
         limits = [height for axis, height in limits_of(experiments, key, [0, 1, 2]) if axis == kind]
-        _level(panels[kind::3].ravel(), finals, limits)
+        used, unused = np.split(panels[kind::3].ravel(), [len(columns)])
+        _level(used, finals, limits)
+        for axis in unused:
+            axis.set_axis_off()
         for axis in panels[kind::3, 0]:
             axis.set_ylabel(title)
     return figure
 
 
 def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[float]) -> None:
-    """Set one scale for all panels of a quantity, and hide those without a curve."""
-    used = [axis for axis in panels if axis.has_data()]
-    low, high = zip(*(axis.get_ylim() for axis in used), strict=True)
+    """Set one scale for all panels of a quantity."""
+    low, high = zip(*(axis.get_ylim() for axis in panels), strict=True)
     cut = 4 * max(limits, default=0.0)
     top = cut if cut > max(finals, default=np.inf) else max(high)
     for axis in panels:
-        axis.set_visible(axis in used)
         axis.tick_params(labelsize=8)
         axis.set_ylim(min(low), min(top, max(high)))
 

@@ -120,7 +120,7 @@ def _final_marks(
     def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
         mark = mark_best(records, name, of, lambda r: r["satisfies"], rivals)
         # single costs are not ranked
-        return lambda row: mark(row) if name == "episode_return" or row["key"] == "cost" else ""
+        return lambda row: mark(row) if name == "episode_return" or row.get("key") == "cost" else ""
 
     def over(row: Record) -> str:
         return "bad" if row.get("excess", 0.0) > 0 else ""

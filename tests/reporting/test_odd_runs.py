@@ -1,6 +1,7 @@
 """One odd run never stops the report, and learns and shows nothing of this machine."""
 
 import json
+import math
 import os
 import re
 
@@ -44,6 +45,7 @@ def instead(run, name):
 
 
 HEAD = "epoch,steps,episodes,episode_return,episode_cost,cost_rate,time_total"
+FREE = "steps,episode_return,time_total\n2000,1,1"
 # what is wrong with a run that is left out
 UNREADABLE = {
     "seed": lambda run: change(run, seed="abc"),
@@ -82,6 +84,7 @@ UNUSUAL = {
     "formula": lambda run: change(run, algo={"name": "=cmd()"}, cost_limits=None),
     "no name": lambda run: change(run, env={}, init_from="/etc"),
     "no limits": lambda run: change(run, cost_limits=...),
+    "no costs": lambda run: [change(run, algo={"name": "a"}, cost_limits={}), table(run, FREE)],
     "infinite": lambda run: table(run, HEAD + "\n1,1000,1,inf,inf,-inf,1\n2,2000,1,nan,1,1,2"),
     "nothing finished": lambda run: table(run, HEAD + "\n1,1000,0,,,,1\n2,2000,0,,,,2"),
     "NaN": lambda run: evaluate(run, json.dumps(EVALUATION).replace("2.0", "NaN")),
@@ -127,6 +130,13 @@ def test_files_that_cannot_be_read_are_left_out_and_their_runs_kept(tmp_path):
     own = {part for place in skipped for part in place.parts if part.startswith("odd")}
     assert own == {f"odd{number}" for number in range(len(UNREADABLE_FILES))}
     assert len(skipped) == len(UNREADABLE_FILES)
+
+
+def test_many_runs_that_have_finished_no_episode_are_shown(tmp_path):
+    for number in range(7):
+        write_run(tmp_path, algo=f"mine{number}", returns=[math.nan], costs=[math.nan])
+    found = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
+    assert len(found.experiments) == 7
 
 
 def test_what_looks_odd_is_shown(tmp_path):
