@@ -175,7 +175,9 @@ def read_archive(folder: Path | str) -> dict[str, Run]:
 def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     """The tables by run, each with the columns in which the run has a number."""
     pandas = import_extra("pandas", "report")
-    rows = pandas.read_csv(path, dtype=defaultdict(lambda: "float", run="str"))
+    kinds = defaultdict(lambda: "float", run="str")
+    # only an empty field is no number: "NA" is the name of a run
+    rows = pandas.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
         # before its first episode has ended, a run has no number in these

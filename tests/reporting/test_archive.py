@@ -118,6 +118,12 @@ def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path
     assert ["frames=3000" in found[seed].command for seed in ("seed0", "seed1")] == [True, False]
 
 
+def test_a_run_may_have_a_name_that_pandas_takes_for_a_missing_number(tmp_path):
+    root = write_run(tmp_path, folder="null").parent
+    keep(root, tmp_path / "kept")
+    assert read_archive(tmp_path / "kept")["null"].table["steps"] == [1000]
+
+
 def test_an_archive_is_not_among_the_runs(runs, capsys):
     assert main([str(runs), f"archive={runs / 'kept'}"]) == 1
     assert "beside" in capsys.readouterr().err
