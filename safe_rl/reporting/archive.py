@@ -148,7 +148,8 @@ def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
     tables = {name: pandas.DataFrame(run.table) for name, run in runs.items()}
     rows = pandas.concat(tables, names=["run", "row"]).reset_index("run").convert_dtypes()
     table = rows.to_csv(index=False, lineterminator="\n")
-    texts = {RUNS: "{" + ",\n".join(lines) + "}\n", ROWS: table}
+    # the list last: a run that it names has its table, also if writing ends half-way
+    texts = {ROWS: table, RUNS: "{" + ",\n".join(lines) + "}\n"}
     for name, text in texts.items():
         with replacing(folder / name) as unfinished:
             unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))

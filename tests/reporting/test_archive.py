@@ -118,6 +118,18 @@ def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path
     assert ["frames=3000" in found[seed].command for seed in ("seed0", "seed1")] == [True, False]
 
 
+def test_an_archive_that_is_written_half_way_has_the_runs_that_it_had(runs, tmp_path, monkeypatch):
+    kept, (first, *others) = tmp_path / "kept", find_runs(runs)[0]
+    archive_runs([first], runs, kept)
+    once = iter([pack])
+    monkeypatch.setattr(gzip, "compress", lambda text, mtime: next(once)(text))
+    with pytest.raises(StopIteration):
+        archive_runs(others, runs, kept)
+    found, skipped = find_runs(kept)
+    assert len(found) == 1
+    assert not skipped
+
+
 def test_a_run_may_have_a_name_that_pandas_takes_for_a_missing_number(tmp_path):
     root = write_run(tmp_path, folder="null").parent
     keep(root, tmp_path / "kept")
