@@ -101,7 +101,7 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
     notes = {
         "overrides": read(folder.overrides),
         # relative to the folder where the run was started, as a user would type them
-        "config_dirs": [os.path.relpath(p, start) if start else p for p in directories],
+        "config_dirs": [os.path.relpath(p, start) if start else p for p in directories] or None,
         "frames_before": before if before != config.get("frames") else None,
         "certificate": read(folder.certificate, read_certificate),
         "code": read(folder.code, read_code),
@@ -109,9 +109,10 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
             {key: value for key, value in found.items() if key not in ("run", "checkpoint_file")}
             for path in folder.evaluations()
             if (found := read(path, read_evaluation))
-        ],
+        ]
+        or None,
     }
-    kept = {name: value for name, value in notes.items() if value}
+    kept = {name: value for name, value in notes.items() if value is not None}
     return Run(folder.directory, config, table, kept)
 
 

@@ -42,10 +42,11 @@ def test_a_run_knows_its_command_and_its_end(tmp_path):
     write_run(tmp_path, returns=(1.0, 2.0), costs=(1, 1), rates=(0, 0), overrides=said)
     write_run(tmp_path, seed=1, frames=9000)
     (tmp_path / "PointGoal1/ppo/seed1/.hydra/overrides.yaml").unlink()
-    first, second = find_runs(tmp_path)[0]
+    write_run(tmp_path, seed=2, overrides=[])
+    first, second, third = find_runs(tmp_path)[0]
     assert first.command == "python train.py env=PointGoal1 'cost_limits={cost: 10}' seed=0"
     assert (first.steps, first.is_finished, first.hours) == (2000, True, 0.002)
-    assert second.command is None
+    assert (second.command, third.command) == (None, "python train.py")
     assert not second.is_finished
     assert find_runs(tmp_path, unfinished=True)[0][1].is_finished
 
