@@ -84,7 +84,7 @@ class Claim:
             without rare high ones.
         cap: Costs of episodes count only up to this value, and at most a share ``most_beyond`` of
             them may cost more. None: no cap, or, for the betting bound if the highest cost is
-            infinite, a cap of ten times the limit.
+            infinite, a cap of ten times the limit (of 10 for a limit of 0).
         most_beyond: Largest share of episodes that may cost more than a cap.
         tail: Share α of the episodes with the highest costs, whose mean is limited (CVaR); 1: the
             mean of all episodes is limited.
@@ -124,7 +124,8 @@ class Claim:
     def _about(self, key: str, costs: np.ndarray) -> Iterator[Statement]:
         limit, highest = self.limits[key], self.highest.get(key, math.inf)
         needs_cap = math.isinf(highest) and self.bound == "betting"
-        cap = 10 * limit if self.cap is None and needs_cap else self.cap
+        # with a cap of 0, every policy would keep a limit of 0
+        cap = 10 * (limit or 1.0) if self.cap is None and needs_cap else self.cap
         capped = costs
         if cap is not None and cap < highest:
             capped, highest = np.where(np.isnan(costs), costs, costs.clip(max=cap)), cap

@@ -135,8 +135,9 @@ def test_candidates_are_ordered_by_what_the_tests_will_ask_for():
     assert rank([[9.0], [5.0], [9.0], [9.0]], costs, [claim] * 4) == [1, 0, 2, 3]
 
 
-def test_a_limit_of_0_is_never_certified():
-    claim = Claim({"cost": 0.0}, highest={"cost": 1000.0})
+@pytest.mark.parametrize("highest", [{"cost": 1000.0}, {}])
+def test_a_limit_of_0_is_never_certified(highest):
+    claim = Claim({"cost": 0.0}, highest=highest)
     assert 0 < claim.shortfalls({"cost": np.zeros(10_000)}, tests=1)["mean_cost"] < 1
 
 
