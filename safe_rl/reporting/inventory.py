@@ -116,7 +116,7 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
         "at": "{checkpoint:,} steps",
         "$J_r$": "{certified_return:.2f}",
         "bound on": "{cost}",
-        "is": "{bound:.3g}",
+        "is": "{bound:.4g}",
         "limit": "{most:g}",
         "episodes": "{episodes:d}",
     }
