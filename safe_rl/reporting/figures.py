@@ -108,8 +108,8 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
         return
     longest = max(len(line) for label in handles for line in label.splitlines())
     legend = figure.legend(
-        handles.values(), handles, loc="outside lower center", frameon=False, handlelength=3.0,
-        ncols=max(1, min(6, len(handles), _LEGEND // (longest + 9))),
+        handles.values(), handles, loc="outside lower center", frameon=False, handlelength=5.0,
+        ncols=max(1, min(6, len(handles), _LEGEND // (longest + 10))),
     )  # fmt: skip
     size = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
