@@ -176,12 +176,9 @@ def final_figures(
         cost_keys: Keys of the costs to report.
     """
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
-    last = final_rows(table)
-    final = {}
-    for name in ("episode_return", *(name for name in costs if name in table)):
-        values = [table[name][row] for row in last]
-        values = [value for value in values if not math.isnan(value)]
-        final[name] = sum(values) / len(values) if values else math.nan
+    names = ["episode_return", *(name for name in costs if name in table)]
+    rows = ({name: table[name][row] for name in names} for row in final_rows(table))
+    final = dict.fromkeys(names, math.nan) | mean_row(rows)
     final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}
     final["steps_per_second"] = table["steps"][-1] / table["time_total"][-1]
     return final
