@@ -31,14 +31,14 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     assert average(runs, "no_such_column", smooth=False) is None
 
 
-def test_a_curve_begins_where_all_of_its_runs_have(tmp_path):
-    nan, alike = float("nan"), {"costs": [1, 1, 1, 1], "rates": [0.1] * 4}
-    write_run(tmp_path, seed=0, returns=[0.0, 2.0, 4.0, 6.0], **alike)
-    write_run(tmp_path, seed=1, returns=[nan, nan, 14.0, 16.0], **alike)
+def test_a_curve_begins_where_all_of_its_runs_have_and_bridges_epochs_without_an_episode(tmp_path):
+    nan, alike = float("nan"), {"costs": [1, 1, 1, 1, 1], "rates": [0.1] * 5}
+    write_run(tmp_path, seed=0, returns=[0.0, 2.0, 4.0, nan, 8.0], **alike)
+    write_run(tmp_path, seed=1, returns=[nan, nan, 14.0, 16.0, 18.0], **alike)
     curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
     # what comes before is of one seed alone, and no mean over seeds
-    np.testing.assert_allclose(curve.steps[[0, -1]], [3000, 4000])
-    np.testing.assert_allclose(curve.mean[[0, -1]], [9.0, 11.0])
+    np.testing.assert_allclose(curve.steps[[0, -1]], [3000, 5000])
+    np.testing.assert_allclose(curve.mean, 9.0 + (curve.steps - 3000) / 500)
 
 
 def test_a_curve_ends_at_the_final_score(tmp_path):
@@ -48,17 +48,6 @@ def test_a_curve_ends_at_the_final_score(tmp_path):
     curve = average(experiment.runs, "episode_cost", smooth=True)
     assert curve.mean[-1] == pytest.approx(25.0)
     assert curve.mean[-1] == pytest.approx(final_record(experiment, ["cost"])["episode_cost"])
-
-
-def test_epochs_without_an_episode_are_bridged(tmp_path):
-    nan = float("nan")
-    values = {"returns": [1.0, nan, 3.0], "costs": [1, nan, 1], "rates": [0.1, 0.1, 0.1]}
-    directory = write_run(tmp_path, **values)
-    text = (directory / "progress.csv").read_text().replace("nan", "")
-    (directory / "progress.csv").write_text(text)
-    curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
-    np.testing.assert_allclose(curve.mean, [1.0, 3.0])
-    np.testing.assert_allclose(curve.steps, [1000, 3000])
 
 
 def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
