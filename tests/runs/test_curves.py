@@ -19,25 +19,23 @@ TABLE = {
 }
 
 
-@pytest.fixture
-def drawn(tmp_path):
-    """Draw, and return the panels that were saved."""
+def drawn(cost_limits, table=TABLE):
+    """The panels of a picture."""
+    return learning_curves(table, cost_limits, 1000, "title").axes
 
-    def draw(cost_limits, table=TABLE):
-        figure = learning_curves(table, cost_limits, 1000, "title")
-        path = save_figure(figure, tmp_path / "curves.png")
+
+def test_a_picture_replaces_the_one_before(tmp_path):
+    for limits in ({"cost": 25.0}, {}):
+        path = save_figure(learning_curves(TABLE, limits, 1000, "title"), tmp_path / "curves.png")
         assert imread(path).std() > 0
-        assert [entry.name for entry in tmp_path.iterdir()] == ["curves.png"]
-        return figure.axes
-
-    return draw
+        assert list(tmp_path.iterdir()) == [path]
 
 
 def heights(axes, style):
     return [line.get_ydata() for line in axes.lines if line.get_linestyle() == style]
 
 
-def test_three_panels_with_dashed_limits(drawn):
+def test_three_panels_with_dashed_limits():
     returns, costs, rates = drawn({"cost": 25.0})
     assert [panel.get_title() for panel in (returns, costs, rates)] == [
         "Return", "Episode cost", "Cost rate",
@@ -48,7 +46,7 @@ def test_three_panels_with_dashed_limits(drawn):
     np.testing.assert_allclose(heights(rates, "-")[0], TABLE["cost_rate"])
 
 
-def test_single_epochs_and_their_moving_mean_over_five(drawn):
+def test_single_epochs_and_their_moving_mean_over_five():
     returns, _, _ = drawn({"cost": 25.0})
     single, mean = returns.lines
     np.testing.assert_allclose(single.get_ydata(), [1, 3, 4, 5, 6, 13])
@@ -63,7 +61,7 @@ def test_a_curve_forgets_an_epoch_that_is_five_epochs_ago(first):
     np.testing.assert_allclose(moving_mean(values, 5), windows)
 
 
-def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
+def test_several_costs_have_a_line_a_limit_and_a_name_each():
     _, costs, rates = drawn({"cost": 25.0, "cost_hazards": 10.0})
     assert sorted(line[0] for line in heights(costs, "--")) == [10.0, 25.0]
     assert sorted(line[0] for line in heights(rates, "--")) == [0.01, 0.025]
@@ -75,7 +73,7 @@ def test_several_costs_have_a_line_a_limit_and_a_name_each(drawn):
     assert len(colours) == 2
 
 
-def test_a_fourth_panel_has_the_multipliers_there_are(drawn):
+def test_a_fourth_panel_has_the_multipliers_there_are():
     multipliers = {"multiplier_cost": [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
     *_, panel = drawn({"cost": 25.0, "cost_hazards": 10.0}, TABLE | multipliers)
     assert panel.get_title() == "Multiplier"
@@ -85,7 +83,7 @@ def test_a_fourth_panel_has_the_multipliers_there_are(drawn):
     assert len(drawn({"cost": 25.0})) == 3
 
 
-def test_a_single_epoch_is_drawn_as_a_point(drawn):
+def test_a_single_epoch_is_drawn_as_a_point():
     panels = drawn({"cost": 25.0}, {name: values[:1] for name, values in TABLE.items()})
     markers = [{line.get_marker() for line in axes.lines} for axes in panels]
     assert all("o" in found for found in markers)
@@ -93,7 +91,7 @@ def test_a_single_epoch_is_drawn_as_a_point(drawn):
     assert not any(line.get_marker() == "o" for line in lines)
 
 
-def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run(drawn):
+def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run():
     none = dict.fromkeys(("episode_return", "episode_cost"), [math.nan] * 7)
     panels = drawn({"cost": 25.0}, TABLE | none)
     assert [[text.get_text() for text in axes.texts] for axes in panels] == [
@@ -103,20 +101,16 @@ def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run(
 
 
 @pytest.mark.parametrize("limits", [{"cost": 25.0}, {"cost": 25.0, "cost_hazards": 10.0}])
-def test_the_legend_covers_no_line(drawn, limits):
-    for axes in drawn(limits)[1:]:
-        legend = axes.get_legend().get_window_extent()
-        labels = axes.xaxis.get_tightbbox()
-        assert 0 <= legend.y0 < legend.y1 <= labels.y0
-
-
-def test_legends_of_neighbours_do_not_touch(drawn):
-    limits = {"cost": 25.0, "cost_hazards": 10.0}
-    extents = [axes.get_legend().get_window_extent() for axes in drawn(limits)]
+def test_a_legend_covers_no_line_and_touches_no_other_legend(limits):
+    figure = learning_curves(TABLE, limits, 1000, "title")
+    figure.draw_without_rendering()
+    extents = [axes.get_legend().get_window_extent() for axes in figure.axes]
+    for axes, legend in zip(figure.axes, extents, strict=True):
+        assert 0 <= legend.y0 < legend.y1 <= axes.xaxis.get_tightbbox().y0
     assert all(left.x1 < right.x0 for left, right in pairwise(extents))
 
 
-def test_without_limits_the_aggregate_cost_is_drawn(drawn):
+def test_without_limits_the_aggregate_cost_is_drawn():
     _, costs, rates = drawn({})
     assert heights(costs, "--") == heights(rates, "--") == []
     np.testing.assert_allclose(heights(rates, "-")[0], TABLE["cost_rate"])
