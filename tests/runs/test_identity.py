@@ -1,6 +1,6 @@
 """One table of what keys are for: against the configurations that there are."""
 
-import itertools
+from functools import cache
 
 import pytest
 from omegaconf import OmegaConf
@@ -20,16 +20,18 @@ def nodes(config, prefix=""):
             yield from nodes(value, f"{prefix}{key}.")
 
 
+@cache
+def as_saved(*overrides):
+    return OmegaConf.to_container(compose_config("env=PointMass", *overrides), resolve=True)
+
+
 @pytest.fixture(scope="module")
 def all_keys():
-    collectors = [compose_config("env=PointMass", f"collector={n}") for n in ("ray", "process")]
-    pairs = [(algorithm, "none") for algorithm in ALGORITHMS]
-    pairs += [(ALGORITHMS[0], logger) for logger in LOGGERS]
-    found = {key for one in collectors for key in nodes(OmegaConf.to_container(one))}
-    for (algo, logger), preset in itertools.product(pairs, ("default", "paper")):
-        config = compose_config("env=PointMass", f"algo={algo}", f"logger={logger}", f"preset={preset}")  # fmt: skip  # noqa: E501
-        found |= set(nodes(OmegaConf.to_container(config)))
-    return found | {"note"}  # which no file has
+    choices = ["preset=paper", "collector=ray", "collector=process"]
+    choices += [f"algo={algorithm}" for algorithm in ALGORITHMS]
+    choices += [f"logger={logger}" for logger in LOGGERS]
+    keys = {key for one in choices for key in nodes(as_saved(one))}
+    return keys | {"note"}  # which no file has
 
 
 def test_every_row_is_about_a_key_that_exists(all_keys):
@@ -73,10 +75,6 @@ def test_a_key_has_the_role_of_the_nearest_row(key, role):
     assert role_of(key) is role
 
 
-def as_saved(*overrides):
-    return OmegaConf.to_container(compose_config("env=PointMass", *overrides), resolve=True)
-
-
 @pytest.mark.parametrize(
     "override",
     ["seed=3", "num_threads=2", "device=meta", "compile=true", "logger=none", "collector=process"],
@@ -110,8 +108,7 @@ def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
 
 def test_a_sweep_continues_an_archived_run_that_lacks_the_kind_of_algorithm():
     now = as_saved()
-    before = as_saved()
-    before["algo"].pop("_target_", None)
+    before = {**now, "algo": {k: v for k, v in now["algo"].items() if k != "_target_"}}
     assert experiment_of(before) == experiment_of(now)
     assert not differences(before, now)
     assert differences(now, as_saved("frames=5", "num_threads=7", "lagrangian.kp=0.5")) == {
