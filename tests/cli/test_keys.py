@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Iterator
+from functools import cache
+from itertools import product, starmap
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from point_mass import PointMass
-from run_configs import CONF
+from run_configs import CONF, compose_config
 
 import safe_rl.objectives
 from safe_rl.algorithms.build_part import find_recipe
@@ -35,16 +36,17 @@ WRONG: list[Any] = [
 NOT_FINITE = [value for value in WRONG if isinstance(value, float) and not math.isfinite(value)]
 
 
-@pytest.fixture(scope="module")
-def configs() -> dict[tuple[str, str], Any]:
-    """Configurations of all algorithms with both presets, for the point mass."""
-    configs = {}
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for algo in ALGORITHMS:
-            for preset, logger in (("default", "tensorboard"), ("paper", "none")):
-                choices = [f"algo={algo}", f"preset={preset}", f"logger={logger}", "env=PointMass"]
-                configs[algo, preset] = compose("config", [*choices, "model.hidden_sizes=[4]"])
-    return configs
+@cache
+def config_of(algo: str, preset: str = "default") -> Any:
+    """The configuration of an algorithm with a preset, for the point mass."""
+    logger = "tensorboard" if preset == "default" else "none"
+    choices = [f"algo={algo}", f"preset={preset}", f"logger={logger}", "env=PointMass"]
+    return compose_config(*choices, "model.hidden_sizes=[4]")
+
+
+def all_configs() -> Iterator[Any]:
+    """Configurations of all algorithms with both presets."""
+    return starmap(config_of, product(ALGORITHMS, ("default", "paper")))
 
 
 def config_parts(node: Any) -> Iterator[Any]:
@@ -66,9 +68,9 @@ def leaves(node: Any, path: str = "") -> Iterator[str]:
 
 
 @pytest.mark.long
-def test_every_key_of_every_file_is_described(configs):
+def test_every_key_of_every_file_is_described():
     targets = set()
-    for config in configs.values():
+    for config in all_configs():
         for path in leaves(plain(config)):
             if path.endswith("_target_") or path.split(".")[0] in ("algo", "paper", "replay"):
                 continue
@@ -83,8 +85,8 @@ def test_every_key_of_every_file_is_described(configs):
     assert len(targets) > 30
 
 
-def test_other_arguments_are_those_that_the_package_hands_over(configs):
-    for config in configs.values():
+def test_other_arguments_are_those_that_the_package_hands_over():
+    for config in all_configs():
         for part in config_parts(plain(config)):
             assert {*part.rows} - {*part.settings} <= LIVE, part
             assert all(row.meaning for row in part.settings.values()), part
@@ -105,10 +107,10 @@ def outcome(config: Any, path: str, value: Any) -> str:
     return ""
 
 
-def keys_of(configs) -> Iterator[tuple[Any, str]]:
+def keys_of_parts() -> Iterator[tuple[Any, str]]:
     """Every key of every part once, with a configuration that has it."""
     seen = set()
-    for config in configs.values():
+    for config in all_configs():
         values = plain(config)
         for path in leaves(values):
             part = OmegaConf.select(config, f"{path.rpartition('.')[0]}._target_")
@@ -118,9 +120,9 @@ def keys_of(configs) -> Iterator[tuple[Any, str]]:
 
 
 @pytest.mark.slow
-def test_no_value_ends_in_a_traceback(configs):
+def test_no_value_ends_in_a_traceback():
     accepted: dict[str, list[Any]] = {}
-    for config, path in keys_of(configs):
+    for config, path in keys_of_parts():
         for value in WRONG:
             words = outcome(config, path, value)
             assert len(words.splitlines()) <= 1, words
@@ -163,8 +165,8 @@ def test_no_value_ends_in_a_traceback(configs):
         ("cost_limits", {"cost": math.inf}, "cost_limits={'cost': inf}: it must be a mapping"),
     ],
 )
-def test_refusals_name_the_key_and_what_it_may_hold(configs, path, value, words):
-    assert words in outcome(configs["ppo_lagrangian", "default"], path, value)
+def test_refusals_name_the_key_and_what_it_may_hold(path, value, words):
+    assert words in outcome(config_of("ppo_lagrangian"), path, value)
 
 
 @pytest.mark.parametrize(
@@ -176,15 +178,15 @@ def test_refusals_name_the_key_and_what_it_may_hold(configs, path, value, words)
                        "num_collectors": 2, "ray_init": {}, "resources": {}}, "ray"),
     ],
 )  # fmt: skip
-def test_missing_extras_are_named(configs, monkeypatch, path, node, extra):
+def test_missing_extras_are_named(monkeypatch, path, node, extra):
     monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
-    words = outcome(configs["ppo", "default"], path, node)
+    words = outcome(config_of("ppo"), path, node)
     assert words.startswith(f"{path}: This needs the package '{extra}'")
     assert words.endswith(f"[{extra}]'")
 
 
-def test_whole_numbers_may_be_written_with_exponents(configs):
-    config = configs["ppo", "default"].copy()
+def test_whole_numbers_may_be_written_with_exponents():
+    config = config_of("ppo").copy()
     config.frames, config.policy_update.num_passes = 3e5, 1e1
     config.model.hidden_sizes = [8.0]
     check_settings(config)
@@ -203,9 +205,9 @@ class OwnLoss(safe_rl.objectives.PPOLagrangianLoss):
     """A part of one's own that takes what it inherits."""
 
 
-def test_parts_of_ones_own_are_checked_by_what_they_inherit(configs, monkeypatch):
+def test_parts_of_ones_own_are_checked_by_what_they_inherit(monkeypatch):
     monkeypatch.setitem(safe_rl.targets._ROOMS, __name__, None)
-    config = configs["ppo_lagrangian", "default"].copy()
+    config = config_of("ppo_lagrangian").copy()
     config.lagrangian._target_ = f"{__name__}.OwnMultiplier"
     config.loss._target_ = f"{__name__}.OwnLoss"
     OmegaConf.update(config, "lagrangian.patience", "anything", force_add=True)
