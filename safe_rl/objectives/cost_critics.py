@@ -172,10 +172,11 @@ class CostCritics(QFunctionLoss):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss [...] with the cost penalty, and diagnostics."""
         values = self.q_values(_COSTS, tensordict, action, "frozen")
-        weights = self.cost_weights(values.detach()).to(values)
+        found = self.of_samples(values.detach(), tensordict)
+        weights = self.cost_weights(found).to(values)
         charges = self.reward_unit * (self.charged(values) @ weights)
         objective = (objective + charges) / (1 + weights.sum())
-        reported = {**self.cost_figures(values.detach()), "cost_weight": weights}
+        reported = {**self.cost_figures(found), "cost_weight": weights}
         return objective, {name: x for name, x in reported.items() if name in self.out_keys}
 
     def charged(self, values: Tensor) -> Tensor:

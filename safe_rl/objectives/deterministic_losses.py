@@ -115,7 +115,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         action = self._act(tensordict, self.actor_network_params)
         values = self.q_values("qvalue_network", tensordict, action, "frozen").squeeze(-1)
         objective, reported = self.penalised(-values[0], tensordict, action)
-        reported["state_action_value_actor"] = values.detach()
+        reported["state_action_value_actor"] = self.of_samples(values.detach(), tensordict)
         return self._mean(objective, tensordict), reported
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
@@ -180,6 +180,7 @@ class BCLoss(ReplayLoss):
     actor_network: TensorDictModuleBase
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
+    reduction = "mean"
 
     def __init__(
         self, actor_network: TensorDictModuleBase, *, loss_function: Distance = "l2"
@@ -192,7 +193,7 @@ class BCLoss(ReplayLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate the loss on steps [...]: a mean over steps and actions.
+        """Evaluate the loss on steps [...]: a mean over steps and actions, without padding.
 
         Raises:
             KeyError: If an entry is missing; the message names it.
@@ -203,4 +204,4 @@ class BCLoss(ReplayLoss):
         with self.actor_network_params.to_module(self.actor_network):
             chosen = self.actor_network(inputs).get(key)
         error = distance_loss(chosen, taken, loss_function=self.loss_function)
-        return TensorDict(loss_actor=error.mean())
+        return TensorDict(loss_actor=self._reduce_loss(error, tensordict))

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
-from safe_rl.objectives.samples import require
+from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import Checked
 
@@ -148,6 +148,12 @@ class QFunctionLoss(ReplayLoss):
         """Mean of losses [...] over the steps, with weights in case of prioritised replay."""
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(losses, tensordict=tensordict, weights=weights)
+
+    @staticmethod
+    def of_samples(values: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Outputs [E, ..., n] of an ensemble for the steps [...] that are not padding."""
+        mask = sample_mask(tensordict)
+        return values if mask is None else values[:, mask]
 
     def q_values(
         self,

@@ -145,7 +145,8 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         loss, metadata = self.actor_loss(tensordict)
         log_prob = metadata.pop("log_prob")
         alpha = self._mean(self.alpha_loss(log_prob), tensordict)
-        metadata |= {"alpha": self._alpha, "entropy": -log_prob.mean()}
+        entropy = -self._reduce_loss(log_prob, tensordict, reduction="mean")
+        metadata |= {"alpha": self._alpha, "entropy": entropy}
         return scalars(loss_actor=loss, loss_alpha=alpha, **metadata)
 
 

@@ -15,6 +15,7 @@ from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import (
+    CALLoss,
     LagrangeMultiplier,
     SACLagrangianLoss,
     SACLoss,
@@ -26,6 +27,7 @@ BOUNDS = -torch.ones(2), torch.ones(2)
 SPEC = Bounded(-1, 1, [2])
 COSTS = ["cost", "cost_other"]
 SAC = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": SPEC}
+CAL = SAC | {"convexity": 10.0, "ratio_memory": 0.9, "largest_ratio": 2.0}
 TD3 = {"gamma": 0.9, "policy_noise": 0.2, "noise_clip": 0.5, "action_spec": SPEC}
 
 
@@ -50,6 +52,7 @@ def make_loss(kind, multiplier=None, networks=2, **keys):
     make_own, settings, plain, constrained = {
         "sac": (make_squashed_actor, SAC, SACLoss, SACLagrangianLoss),
         "td3": (make_bounded_actor, TD3, TD3Loss, TD3LagrangianLoss),
+        "cal": (make_squashed_actor, CAL, SACLoss, CALLoss),
     }[kind]
     actor = make_own(3, *BOUNDS, hidden_sizes=[8])
     if multiplier is None:
@@ -321,6 +324,18 @@ def test_an_entry_of_another_shape_is_named_with_the_shape_that_it_must_have(kin
     steps["next", key] = steps["next", key].squeeze(-1)
     with pytest.raises(ValueError, match=rf"'{key}'\) has the shape \[6\], and must have \[6, 1\]"):
         make_loss(kind, lagrange(1.0, 1.0))(steps)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_what_stands_in_the_padding_does_not_matter(kind):
+    loss, steps, found = make_loss(kind, lagrange(1.0, 1.0)), make_steps(), []
+    steps["collector", "mask"] = torch.arange(6) < 4
+    loss.register_buffer("discounted_limit", torch.zeros(2))  # of CAL
+    for value in (0.0, 9.0):
+        steps["observation"][4:] = value
+        torch.manual_seed(1)
+        found.append(loss(steps.clone()).to_dict())
+    torch.testing.assert_close(*found)
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
