@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
@@ -198,7 +198,7 @@ _SMALLEST = 1e-8
 """ε, added to TD errors, so that every transition can be drawn."""
 
 
-class ProportionalSampler(Resumable, Sampler):
+class ProportionalSampler(Resumable, PrioritizedSampler):
     """Samples transition i with probability p_i / Σ p, where p = (|TD error| + ε)^α.
 
     Schaul et al. 2016, section 3.3. Samples have the importance weights (p_i / min p)^−β (section
@@ -207,7 +207,8 @@ class ProportionalSampler(Resumable, Sampler):
     TorchRL's `PrioritizedSampler` has three problems: it needs a compiled extension that is missing
     if torch is newer than the version it was built for; it samples from NumPy's generator, which a
     run does not seed; and it gives new transitions no priority. This class sums all priorities for
-    every sample, a millisecond for a million transitions.
+    every sample, a millisecond for a million transitions. It is a subclass, because only those get
+    priorities from a buffer's ``update_tensordict_priority``.
 
     Args:
         capacity: Largest number of transitions.
@@ -215,7 +216,8 @@ class ProportionalSampler(Resumable, Sampler):
         beta: β, 0 for no weights.
 
     Raises:
-        ValueError: If an exponent is negative.
+        ValueError: If an exponent is negative, or, when samples are drawn, if the storage has more
+            than one dimension.
 
     Examples:
         >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -228,13 +230,21 @@ class ProportionalSampler(Resumable, Sampler):
     """
 
     state_names = ("_priorities", "_largest")
+    alpha = beta = 0.0  # not the properties of the base class
+    reduction, __repr__ = "max", Sampler.__repr__
 
     def __init__(self, capacity: int, *, alpha: float, beta: float) -> None:
+        # the constructor of the base class needs the extension
         if min(alpha, beta) < 0:
             raise ValueError(f"alpha={alpha} and beta={beta} must be at least 0.")
         self.alpha, self.beta = alpha, beta
         self._priorities = torch.zeros(capacity, dtype=torch.float64)
         self._largest = 1.0
+
+    @property
+    def default_priority(self) -> float:
+        """TD error of the largest priority so far."""
+        return self._largest ** (1 / self.alpha) - _SMALLEST if self.alpha else 1.0
 
     def add(self, index: int | Tensor) -> None:
         """Give new transitions the largest priority so far."""
@@ -248,6 +258,8 @@ class ProportionalSampler(Resumable, Sampler):
         Returns:
             Indices [B] and, as ``priority_weight``, the importance weights [B].
         """
+        if storage.ndim > 1:
+            raise ValueError("ProportionalSampler needs a storage of one dimension: flatten steps.")
         present = self._priorities[: len(storage)]
         sums = present.cumsum(0)
         drawn = torch.rand(batch_size, dtype=sums.dtype, generator=self._rng) * sums[-1]
@@ -271,6 +283,7 @@ class ProportionalSampler(Resumable, Sampler):
 
     def dumps(self, path: Path) -> None:
         """Write the state into a folder."""
+        Path(path).mkdir(parents=True, exist_ok=True)
         torch.save(self.state_dict(), Path(path) / "sampler.pt")
 
     def loads(self, path: Path) -> None:
