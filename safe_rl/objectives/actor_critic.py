@@ -59,11 +59,20 @@ class ActorCriticLoss(LossModule):
         return list(dict.fromkeys([*self.policy_loss.in_keys, *self.critic_loss.in_keys]))
 
     def set_keys(self, **kwargs: NestedKey) -> None:
-        """Set the keys of batch entries; each of the two losses gets the keys that it has."""
+        """Set the keys of batch entries; each of the two losses gets the keys that it has.
+
+        Keys of advantage estimators, which TorchRL's trainers also pass, are ignored.
+
+        Raises:
+            ValueError: If neither the losses nor the estimators have such a key.
+        """
         parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
-        for part in parts:
-            known = part._AcceptedKeys.__dataclass_fields__
-            part.set_keys(**{name: key for name, key in kwargs.items() if name in known})
+        known = [set(part._AcceptedKeys.__dataclass_fields__) for part in parts]
+        accepted = known[0] | known[1] | set(VectorGAE._AcceptedKeys.__dataclass_fields__)
+        if unknown := sorted(kwargs.keys() - accepted):
+            raise ValueError(f"There is no key {unknown[0]!r}, only {sorted(accepted)}.")
+        for part, names in zip(parts, known, strict=True):
+            part.set_keys(**{name: kwargs[name] for name in kwargs.keys() & names})
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

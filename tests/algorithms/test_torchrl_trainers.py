@@ -118,6 +118,8 @@ def test_keys_reach_the_part_that_reads_them():
     assert policy.tensor_keys.action == "a"
     assert critics.tensor_keys.value_target == "v"
     assert {"a", "v"} <= set(loss.in_keys)
+    with pytest.raises(ValueError, match="no key 'advantages'"):
+        loss.set_keys(advantages="a")
     cost = CostGAE(["cost"], None, **SETTINGS)
     estimator = JointAdvantages(VectorGAE(None, **SETTINGS), cost)
     estimator.set_keys(reward="r", done="d", terminated="t")
