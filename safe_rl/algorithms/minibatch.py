@@ -17,11 +17,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.objectives import LossModule
-from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
-from safe_rl.objectives.samples import learning_samples, require_finite
+from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.ranges import PART, Count, Positive, Range, Share
 
@@ -202,11 +201,12 @@ class MinibatchUpdate(PolicyUpdate):
 
     def _samples(self, batch: TensorDictBase) -> TensorDictBase:
         """Entries of a batch that the loss reads, without padding; refuses non-finite entries."""
-        require_finite(batch, self.loss.in_keys)
-        mask_keys = [key for key in AUTO_LOSS_MASK_KEYS if batch.get(key, None) is not None]
-        selected = batch.select(*self.loss.in_keys, *mask_keys)
-        selected.update(batch.select(*estimates_read(self.loss), strict=False))
-        return learning_samples(selected, self.loss.in_keys)
+        selected = batch.select(*self.loss.in_keys)
+        others = [*mask_keys(self.loss), *estimates_read(self.loss)]
+        selected.update(batch.select(*others, strict=False))
+        samples = learning_samples(selected, self.loss.in_keys, self.loss)
+        require_finite(samples, self.loss.in_keys)
+        return samples
 
     def _next_rate(self, share_of_steps: float, kl: Tensor) -> Tensor:
         """Adapt the learning rate after an update, if it took a step, and return the rate."""

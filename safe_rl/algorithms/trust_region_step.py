@@ -180,9 +180,9 @@ class TRPOStep(PolicyUpdate):
             FloatingPointError: If an entry of the batch, the loss or the step is not finite; then
                 the policy has not changed.
         """
+        batch = learning_samples(batch, self.actor_network.in_keys, self.loss)
         if isinstance(self.loss, LossModule):
             require_finite(batch, self.loss.in_keys)
-        batch = learning_samples(batch, self.actor_network.in_keys)
         with torch.no_grad():
             reference = ReferencePolicy(policy_in(self.actor_network, batch))
         losses = self.loss(batch)

@@ -182,7 +182,7 @@ class CriticLoss(LossModule):
                 f"{tuple(target.shape)}: the {name} needs one output per target."
             )
         error = (value - target).square().sum(-1)
-        mask = sample_mask(tensordict)
+        mask = sample_mask(tensordict, self)
         found, wanted = value.detach(), target
         if mask is not None:
             found, wanted = found[mask], wanted[mask]

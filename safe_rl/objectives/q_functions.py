@@ -149,10 +149,9 @@ class QFunctionLoss(ReplayLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(losses, tensordict=tensordict, weights=weights)
 
-    @staticmethod
-    def of_samples(values: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def of_samples(self, values: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Outputs [E, ..., n] of an ensemble for the steps [...] that are not padding."""
-        mask = sample_mask(tensordict)
+        mask = sample_mask(tensordict, self)
         return values if mask is None else values[:, mask]
 
     def q_values(

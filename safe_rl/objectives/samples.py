@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS, LossModule
 
 from safe_rl.naming import key_name, nearest
 
@@ -36,26 +37,34 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
 FIRST = "is_init"
 
 
-def sample_mask(tensordict: TensorDictBase) -> Tensor | None:
+def sample_mask(tensordict: TensorDictBase, loss: Any = None) -> Tensor | None:
     """Bool mask of the entries of a batch that are samples, not padding; None without padding.
 
     Trajectories of different lengths in one batch are padded. The mask is the one of TorchRL's
-    collectors (``split_trajs=True``) and value estimators, which TorchRL's losses use too.
+    collectors (``split_trajs=True``) and value estimators, which TorchRL's losses use too, or what
+    the ``loss_mask_key`` of a loss names.
     """
-    masks = [tensordict.get(key, None) for key in AUTO_LOSS_MASK_KEYS]
+    masks = [tensordict.get(key, None) for key in mask_keys(loss)]
     present = [mask.reshape(tensordict.batch_size) for mask in masks if mask is not None]
     return torch.stack(present).all(0) if present else None
 
 
-def flat_samples(batch: TensorDictBase) -> TensorDictBase:
+def mask_keys(loss: Any = None) -> tuple[NestedKey, ...]:
+    """Keys of the masks that a loss applies; those of TorchRL if it is no `LossModule`."""
+    return loss._loss_mask_keys() if isinstance(loss, LossModule) else AUTO_LOSS_MASK_KEYS
+
+
+def flat_samples(batch: TensorDictBase, loss: Any = None) -> TensorDictBase:
     """The samples of a batch of any shape as a batch [B], without padding."""
-    mask = sample_mask(batch)
+    mask = sample_mask(batch, loss)
     flat = batch.reshape(-1)
     return flat if mask is None else flat[mask.reshape(-1)]
 
 
-def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> TensorDictBase:
-    """Samples [B] for a policy with these inputs, or sequences [N, T] if it is recurrent.
+def learning_samples(
+    batch: TensorDictBase, in_keys: Iterable[NestedKey], loss: Any
+) -> TensorDictBase:
+    """Samples [B] of a loss for a policy with these inputs, or sequences [N, T] if it is recurrent.
 
     Sequences stay whole and in order. A recurrent policy reads `is_init`, which marks the first
     steps of episodes.
@@ -64,8 +73,8 @@ def learning_samples(batch: TensorDictBase, in_keys: Iterable[NestedKey]) -> Ten
         ValueError: If sequences are padded.
     """
     if FIRST not in in_keys:
-        return flat_samples(batch)
-    if sample_mask(batch) is not None or batch.ndim != 2:
+        return flat_samples(batch, loss)
+    if sample_mask(batch, loss) is not None or batch.ndim != 2:
         raise ValueError(
             "A recurrent policy learns from whole sequences [N, T] as collectors make them, "
             "without padding: leave split_trajs at False."

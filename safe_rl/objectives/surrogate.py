@@ -162,7 +162,7 @@ class SurrogateLoss(Checked, LossModule):
         out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(bonus, tensordict)
         out["kl"] = self._reduce_loss(divergence.detach(), tensordict, reduction="mean")
         out["entropy"] = self._reduce_loss(bonus.detach(), tensordict, reduction="mean")
-        out["ESS"] = effective_sample_size(log_weight.detach(), sample_mask(tensordict))
+        out["ESS"] = effective_sample_size(log_weight.detach(), sample_mask(tensordict, self))
         losses = TensorDict(out)
         self._clear_weakrefs(
             tensordict, losses, "actor_network_params", "target_actor_network_params"

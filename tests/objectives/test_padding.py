@@ -121,13 +121,18 @@ def make_update(kind, actor):
 
 
 @pytest.mark.parametrize("kind", ["minibatch", "trpo", "cpo"])
-def test_updates(kind):
+@pytest.mark.parametrize("key", ["auto", "kept"])
+def test_updates(kind, key):
     results = []
     for index in (0, 1):
         torch.manual_seed(5)
         actor, *batches = padded_pair()
+        if key != "auto":
+            batches[1].rename_key_(("collector", "mask"), key)
         update = make_update(kind, actor)
+        update.loss.loss_mask_key = key
         metrics = update(batches[index], torch.tensor([-1.0]), torch.tensor(20.0))
-        results.append(([p.detach().clone() for p in actor.parameters()], metrics["kl"]))
+        ess = update.loss(batches[index])["ESS"]
+        results.append(([p.detach().clone() for p in actor.parameters()], metrics["kl"], ess))
     torch.testing.assert_close(results[0], results[1])
     assert results[0][1] > 0
