@@ -113,7 +113,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             constraints=constraints,
             cost_limits=limits,
         )
-        _check_risk(config, constraints, loss)
+        _check_loss(config, constraints, loss)
         buffer: Memory = build_part(
             config.memory,
             in_keys=loss.in_keys,
@@ -236,8 +236,13 @@ def _check_room(buffer: Memory, random_steps: int, collects: bool) -> None:
         )
 
 
-def _check_risk(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
-    """Refuse a risk measure that the cost critics do not support."""
+def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
+    """Refuse priorities without TD errors, and a risk measure that the critics do not support."""
+    if config.memory.get("prioritised") and loss.priority_key is None:
+        raise ValueError(
+            f"memory.prioritised: algo={config.algo.name} has no TD errors by which transitions "
+            "are drawn. Use memory.prioritised=null."
+        )
     risk, known = constraints.risk, loss.risk_measure
     if risk is None or (known is not None and isinstance(risk, known)):
         return

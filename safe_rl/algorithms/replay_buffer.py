@@ -139,7 +139,7 @@ class Memory(Checked):
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
             yield from drawn.split(self.batch_size)
 
-    def learned(self, minibatch: TensorDictBase, priority: NestedKey = "td_error") -> None:
+    def learned(self, minibatch: TensorDictBase, priority: NestedKey | None = "td_error") -> None:
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
         if self._is_prioritised:
             self._buffer.update_priority(minibatch["index"], minibatch[priority])

@@ -77,8 +77,8 @@ class ReplayLoss(Checked, LossModule):
     risk_measure: ClassVar[type | None] = None
 
     @property
-    def priority_key(self) -> NestedKey:
-        """Key of the TD errors, [...], for prioritised replay."""
+    def priority_key(self) -> NestedKey | None:
+        """Key of the TD errors, [...], for prioritised replay; None if the loss writes none."""
         return "td_error"
 
     def target_pairs(self) -> list[tuple[Tensor, Tensor]]:

@@ -210,6 +210,8 @@ def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path)
     with pytest.raises(ValueError, match="the replay buffer holds 160 transitions") as error:
         OffPolicy.build(offline_config(data, "memory.batch_size=512"), PointMass(4))
     assert "a minibatch of 512 (memory.batch_size)" in str(error.value)
+    with pytest.raises(ValueError, match="algo=bc has no TD errors"):
+        OffPolicy.build(offline_config(data, "memory.prioritised={alpha: 1}"), PointMass(4))
 
 
 @pytest.mark.parametrize(
