@@ -18,7 +18,6 @@ from safe_rl.objectives.q_functions import (
     QFunctionLoss,
     ReplayLoss,
     check_ensemble,
-    scalars,
 )
 from safe_rl.objectives.samples import require
 from safe_rl.ranges import NotNegative, Share
@@ -103,7 +102,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         # TorchRL's errors are squared
         td_error = metadata["td_error"].detach().max(0).values.sqrt()
         tensordict.set(self.tensor_keys.priority, td_error)
-        return scalars(loss_qvalue=loss)
+        return TensorDict(loss_qvalue=loss)
 
     def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
         inputs = steps.select(*self.actor_network.in_keys, strict=False)
@@ -122,7 +121,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         """Loss of the policy, and the mean value of its actions."""
         loss, metadata = self.actor_loss(tensordict)
         values = metadata.pop("state_action_value_actor")
-        return scalars(loss_actor=loss, qvalue=values.mean(), **metadata)
+        return TensorDict(loss_actor=loss, qvalue=values.mean(), **metadata)
 
 
 class TD3LagrangianLoss(CostCritics, TD3Loss):

@@ -225,8 +225,3 @@ def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) ->
     """γ; if `spanned` has the number n of steps per transition, [..., 1], γⁿ."""
     steps = tensordict.get(spanned, None)
     return gamma if steps is None else gamma ** steps.reshape(*tensordict.batch_size, 1)
-
-
-def scalars(**entries: Tensor) -> TensorDict:
-    """Losses and diagnostics without batch dimension."""
-    return TensorDict(entries, batch_size=[])

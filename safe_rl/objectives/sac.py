@@ -23,7 +23,6 @@ from safe_rl.objectives.q_functions import (
     QFunctionLoss,
     check_ensemble,
     discount_of,
-    scalars,
 )
 from safe_rl.objectives.samples import require
 from safe_rl.ranges import Number, Range, Share
@@ -130,7 +129,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         values = self.q_values("qvalue_network", tensordict, action).squeeze(-1)
         errors = distance_loss(values, target.expand_as(values), loss_function=self.loss_function)
         tensordict.set(keys.priority, (values.detach() - target).abs().max(0).values)
-        return scalars(loss_qvalue=self._mean(errors.sum(0), tensordict))
+        return TensorDict(loss_qvalue=self._mean(errors.sum(0), tensordict))
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the policy, with the penalty on costs if there are cost critics."""
@@ -147,7 +146,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         alpha = self._mean(self.alpha_loss(log_prob), tensordict)
         entropy = -self._reduce_loss(log_prob, tensordict, reduction="mean")
         metadata |= {"alpha": self._alpha, "entropy": entropy}
-        return scalars(loss_actor=loss, loss_alpha=alpha, **metadata)
+        return TensorDict(loss_actor=loss, loss_alpha=alpha, **metadata)
 
 
 class SACLagrangianLoss(CostCritics, SACLoss):
