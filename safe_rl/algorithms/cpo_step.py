@@ -205,8 +205,8 @@ class PCPOStep(CPOStep):
     def _propose(self, problem: StepProblem) -> Proposal:
         g, b, c = self._linearised(problem)
         v, w = self._solve_all(problem.fisher, g, b)
-        q, c = g @ v, self._bounded(c, (b * w).sum(-1))
-        for_reward = torch.where(q > 0, (2 * self.target_kl / q).sqrt(), 0.0) * -v
+        c = self._bounded(c, (b * w).sum(-1))
+        for_reward = self._longest(v, g)
         back = w if self.projection == "kl" else b
         nu = nearest_feasible(c + b @ for_reward, b @ back.T)
         step = for_reward - nu @ back

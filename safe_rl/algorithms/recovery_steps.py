@@ -124,8 +124,6 @@ class CTRPOStep(TRPOStep):
         gram = torch.eye(len(root), dtype=root.dtype, device=root.device)
         gram = gram + root[:, None] * (b @ w.T) * root
         direction = v - (root * torch.linalg.solve(gram, root * (b @ v))) @ w
-        squared = (g @ direction).clamp_min(0)
-        scale = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
         before = loss.detach()
 
         def is_acceptable(after: TensorDictBase, kl: Tensor) -> bool:
@@ -134,7 +132,7 @@ class CTRPOStep(TRPOStep):
             return bool((divergence <= self.target_kl) & (objective(after) <= before))
 
         diagnostics = {"recovers": self.recovering.to(surrogates.dtype)}
-        return Proposal(-scale * direction, is_acceptable, diagnostics)
+        return Proposal(self._longest(direction, g), is_acceptable, diagnostics)
 
 
 class CRPOStep(TRPOStep):

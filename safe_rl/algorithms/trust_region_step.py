@@ -210,11 +210,14 @@ class TRPOStep(PolicyUpdate):
         loss = objective(problem.losses)
         gradient = flat_gradient(loss, self.parameters)
         direction, _ = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
-        # Conjugate gradients leave a residual orthogonal to the solution x, so that xᵀHx = xᵀg.
-        squared = (gradient @ direction).clamp_min(0)
-        length = torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0)
-        before = loss.detach()
-        return Proposal(-length * direction, lambda after, kl: bool(objective(after) <= before), {})
+        step, before = self._longest(direction, gradient), loss.detach()
+        return Proposal(step, lambda after, kl: bool(objective(after) <= before), {})
+
+    def _longest(self, x: Tensor, g: Tensor) -> Tensor:
+        """The longest step along −x within the trust region, [P], for a solution x of H x = g."""
+        # Conjugate gradients leave a residual orthogonal to x, so that xᵀHx = xᵀg.
+        squared = (g @ x).clamp_min(0)
+        return -torch.where(squared > 0, (2 * self.target_kl / squared).sqrt(), 0.0) * x
 
     def _gradients(self, surrogates: Iterable[Tensor]) -> Tensor:
         """Gradients of k scalars, [k, P]; their graph is kept for further derivatives."""
