@@ -7,11 +7,10 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Bounded, LazyTensorStorage
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.algorithms import Memory, ReplayUpdate
-from safe_rl.algorithms.replay_buffer import ProportionalSampler
 from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import SACLoss, TD3Loss
 
@@ -202,23 +201,18 @@ def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
 
 
 def test_a_buffer_of_torchrl_passes_errors_to_the_sampler_and_saves_it(tmp_path):
-    buffers = [
-        TensorDictReplayBuffer(
-            storage=LazyTensorStorage(9), sampler=ProportionalSampler(9, alpha=0.5, beta=1.0),
-            batch_size=64,
-        )
-        for _ in range(2)
-    ]  # fmt: skip
-    buffers[0].extend(make_batch(0, 4, rows=1).reshape(-1))
-    drawn = buffers[0].sample()
-    buffers[0].update_tensordict_priority(drawn.set("td_error", drawn["observation"]))
-    buffers[0].dumps(tmp_path)
-    buffers[1].loads(tmp_path)
-    buffers[1].add(make_batch(4, 1, rows=1)[0, 0])
-    found = buffers[1].sampler.state_dict()["_priorities"][:5]
+    exponents = {"alpha": 0.5, "beta": 1.0}
+    first, second = (make_memory(capacity=9, prioritised=exponents)._buffer for _ in range(2))
+    first.extend(make_batch(0, 4, rows=1).reshape(-1))
+    drawn = first.sample(64)
+    first.update_tensordict_priority(drawn.set("td_error", drawn["observation"]))
+    first.dumps(tmp_path)
+    second.loads(tmp_path)
+    second.add(make_batch(4, 1, rows=1)[0, 0])
+    found = second.sampler.state_dict()["_priorities"][:5]
     assert found.numpy() == pytest.approx(np.sqrt([0, 1, 2, 3, 3]), abs=1e-3)
     with pytest.raises(ValueError, match="one dimension"):
-        buffers[1].sampler.sample(LazyTensorStorage(9, ndim=2), 1)
+        second.sampler.sample(LazyTensorStorage(9, ndim=2), 1)
 
 
 def test_errors_are_read_where_the_loss_writes_them():

@@ -128,9 +128,7 @@ def test_a_squashed_normal_is_torchrls():
     assert ours.rsample_and_log_prob((3,))[1].shape == (3, 6)
     with pytest.raises(AttributeError, match="has no attribute 'colour'"):
         _ = ours.colour
-
-
-def test_samples_at_the_bounds_are_scored():
+    # samples at the bounds are scored
     far = SquashedNormal(torch.full((4, 2), 30.0), torch.ones(4, 2), low=LOW, high=HIGH)
     action, log_prob = far.rsample_and_log_prob()
     assert torch.equal(action, HIGH.expand(4, 2))

@@ -116,9 +116,8 @@ def test_the_limit_follows_what_batches_say_and_not_too_far():
         assert loss.discounted_limit[0].item() == pytest.approx(25 * ratio, rel=1e-3)
         # critics that say that there is a cost where there is none
         assert loss.discounted_limit[1].item() == pytest.approx(1.0, rel=1e-3)
-    state = loss.state_dict()
     other = make_loss(gamma=0.99)
-    other.load_state_dict(state)
+    other.load_state_dict(loss.state_dict())
     for each in (loss, other):
         each.calibrate(known([10.0, 1.0], [0.0, 0.0]))
     assert torch.equal(loss.discounted_limit, other.discounted_limit)

@@ -90,8 +90,3 @@ def test_costs_are_controlled_separately():
     first = run([14.0, 11.0], limits=10.0, kp=0.1, ki=0.05, kd=0.02)
     second = run([1.0, 9.0], limits=4.0, kp=0.1, ki=0.05, kd=0.02)
     torch.testing.assert_close(torch.tensor(both).T, torch.tensor([first, second]))
-
-
-def test_a_limit_of_0_is_no_unit():
-    with pytest.raises(ValueError, match="limit of 0"):
-        run([], limits=0.0, scale="limit")

@@ -40,8 +40,7 @@ def test_nan_leaves_only_that_cost_unchanged():
         single.update([known])
     after_one = lagrange([5.0])
     after_one.update([4.0])
-    expected = torch.cat([single.nu, after_one.nu])
-    torch.testing.assert_close(multiplier.nu, expected)
+    torch.testing.assert_close(multiplier.nu, torch.cat([single.nu, after_one.nu]))
     torch.testing.assert_close(multiplier.step, torch.tensor([3.0, 1.0]))
 
 
@@ -99,6 +98,7 @@ def test_limits_keep_their_keys(limits, keys):
         (lambda: lagrange(init=0.0), "above 0"),
         (lambda: lagrange([1.0, 2.0], init=[1.0, 1.0, 1.0]), "2 numbers"),
         (lambda: lagrange([1.0, 2.0]).update([1.0]), "each of"),
+        (lambda: KINDS["pid"](0.0), "limit of 0"),
     ],
 )
 def test_errors_say_what_to_change(build, message):
