@@ -63,6 +63,8 @@ def compose_jobs(
     """
     overrides = [parse(text) for text in texts]
     _check_form(overrides)
+    if sweep and any(override.key_or_group == "hydra.run.dir" for override in overrides):
+        raise CommandLineError("hydra.run.dir is for a single run: write hydra.sweep.dir with -m.")
     with hydra_on_conf():
         jobs = list(_jobs(overrides)) if sweep else [list(texts)]
         configs = [_compose(job) for job in jobs]
@@ -114,7 +116,10 @@ def _check_form(overrides: Sequence[Override]) -> None:
                 f"'{line}': {GIVEN_WHOLE[section]} are given all at once, as "
                 f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
             )
-        if key in _ONE_EACH and isinstance(values := override.value(), list):
+        values = override.value() if key in _ONE_EACH else ""
+        if values is None:
+            raise CommandLineError(f"'{line}': {key} is a name; no logger is logger=none.")
+        if isinstance(values, list):
             raise CommandLineError(
                 f"'{line}': a run has one {key}; for a run with each of them: "
                 f"-m {key}={','.join(map(str, values))}"

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from safe_rl.cli.grammar import run_command
+from safe_rl.cli.grammar import CommandLineError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import option
 
@@ -39,6 +39,8 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     run, target = Run(find_run(words[0])), Path(words[1])
     has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
+    if target.suffix not in ("", ".onnx"):
+        raise CommandLineError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
         check_imports(run.config, modules, run.directory)
         with closing(run.make_env()) as env:

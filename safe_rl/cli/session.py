@@ -156,7 +156,9 @@ class Session:
         """Build the run, or continue the one in the folder; None if that is finished."""
         if "RL_LOGGING_LEVEL" not in os.environ:  # which users set to see more of TorchRL's notes
             logging.getLogger("torchrl").setLevel(logging.WARNING)
-        config, folder = self.config, self.folder
+        config, folder, callbacks = self.config, self.folder, self._callbacks
+        if not (isinstance(callbacks, list | tuple) and all(map(callable, callbacks))):
+            raise ConfigError(f"callbacks must be a list of functions, [f], got {callbacks!r}.")
         if not self._continues and folder.has_begun:
             key = "hydra.run.dir" if self._program else "directory"
             raise FileExistsError(
@@ -174,7 +176,7 @@ class Session:
             print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
         seed_everything(config.seed, config.num_threads)
         trainer = self._build()
-        trainer.callbacks = self._callbacks
+        trainer.callbacks = callbacks
         if trainer.algorithm.learns_from:
             print(trainer.algorithm.learns_from)
         if trainer.algorithm.schedule:

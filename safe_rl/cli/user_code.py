@@ -27,8 +27,10 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
         >>> note_imports(["mine", "examples/other.py"])
         ["++import=['mine','examples/other.py']"]
     """
-    modules = [modules] if isinstance(modules, str) else modules
-    return [] if modules is None else list(overrides_of({f"++{IMPORT}": list(modules)}))
+    if modules is None:
+        return []
+    listed = list(modules) if isinstance(modules, list | tuple) else [modules]
+    return list(overrides_of({f"++{IMPORT}": listed}))
 
 
 def import_modules(modules: str | Sequence[str] | None) -> None:

@@ -8,6 +8,7 @@ cell can run twice. Environments that exist already do not change.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -108,9 +109,16 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
         0.1
     """
     _refuse_taken("element", element.kind)
+    _require_functions(height=element.height, geoms=element.geoms)
+    _require_member("motion", element.motion, Motion)
     others = [row for row in ELEMENTS if row.kind != element.kind]
     if element.label in {"robot", "floor", *(row.label for row in others)}:
         raise ConfigError(f"Another object is called '{element.label}': choose another label.")
+    if element.singular and f"{element.kind}_num" in (keys or {}):
+        raise ConfigError(
+            f"There is only one object if 'label' and 'kind' are both '{element.kind}': give "
+            f"another label, or remove '{element.kind}_num'."
+        )
     _add_keys(keys, _keys_of(element))
     # Rows of one motion stand together, because slots, bodies and `qpos` are in their order.
     place = 1 + max(i for i, row in enumerate(others) if row.motion is element.motion)
@@ -137,6 +145,10 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         >>> register_task("away", away, keys={"reward_away": 0.5})
     """
     _refuse_taken("task", name)
+    has_goals = {} if task.met is None else {"met": task.met}
+    _require_functions(reward=task.reward, measure=task.measure, **has_goals)
+    if task.next_goal is not None:
+        _require_member("next_goal", task.next_goal, NextGoal)
     for kinds in (task.elements, task.touches, task.at_origin):
         _refuse_unknown_kinds(kinds)
     for kind in (kind for kind in task.elements if not BY_KIND[kind].singular):
@@ -167,6 +179,7 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
         >>> register_cost(speeding, keys={"constrain_speed": False, "speed_limit": 1.0})
     """
     _refuse_taken("cost", cost.key)
+    _require_functions(active=cost.active, magnitude=cost.magnitude)
     if not cost.key.startswith("cost_"):
         raise ConfigError(f"The cost key '{cost.key}' must start with 'cost_'.")
     _refuse_unknown_kinds(cost.touches)
@@ -195,6 +208,7 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
         >>> register_observation(height, keys={"observe_height": False})
     """
     _refuse_taken("observation", reading.name)
+    _require_functions(present=reading.present, size=reading.size, read=reading.read)
     _refuse_unknown_kinds(reading.touches)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
@@ -216,6 +230,18 @@ def register_robot(name: str, path: str | Path) -> None:
 def _refuse_taken(what: str, name: str) -> None:
     if name in _BUILT_IN[what]:
         raise ConfigError(f"'{name}' is a built-in {what}: choose another name.")
+
+
+def _require_functions(**given: Any) -> None:
+    for name, value in given.items():
+        if not callable(value):
+            raise ConfigError(f"'{name}' must be a function, such as a lambda, got {value!r}.")
+
+
+def _require_member(name: str, value: Any, kind: type[Enum]) -> None:
+    if not isinstance(value, kind):
+        members = " or ".join(map(str, kind))
+        raise ConfigError(f"'{name}' must be {members}, got {value!r}.")
 
 
 def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:

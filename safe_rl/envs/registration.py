@@ -14,6 +14,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import GROUP, config_node, env_names, env_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
@@ -83,7 +84,8 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
             may then be imported, as with `import=`.
 
     Raises:
-        ConfigError: For an unknown key, or a value that cannot be used.
+        ConfigError: For the name of a built-in environment, an unknown key, or a value that cannot
+            be used.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -91,6 +93,8 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
         >>> make_env("CrowdedPoint").config.hazards_num
         9
     """
+    if name in env_names():
+        raise ConfigError(f"'{name}' is a built-in environment: choose another name.")
     if isinstance(config, Mapping) and config.get("_target_") is not None:
         node = {"name": name, **config}
         module = str(config["_target_"]).rpartition(".")[0]

@@ -125,7 +125,9 @@ class SimulatedEnv(ConstrainedEnv):
         self._episode.zero_()
 
     @torch.no_grad()
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None = None, **others: Any) -> TensorDictBase:
+        if others:
+            raise TypeError(f"reset takes no {', '.join(others)}; call env.set_seed(…) before it.")
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             mask = torch.ones_like(self._begun)

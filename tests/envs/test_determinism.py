@@ -67,6 +67,8 @@ def test_seeding_starts_over(name):
     assert_same(*runs)
     env.set_seed(6)
     assert not torch.equal(env.reset()["observation"], runs[0]["observation"][:, 0])
+    with pytest.raises(TypeError, match=r"reset takes no seed; call env\.set_seed"):
+        env.reset(seed=5)
 
 
 @pytest.mark.parametrize("name", ["goal", "SafeHopperVelocity"])

@@ -60,6 +60,8 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
 def test_names_of_families_and_of_2019_are_known():
     assert make_env("SafeSwimmerVelocity").config.robot == "swimmer"
     assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"
+    with pytest.raises(ConfigError, match="'PointGoal1' is a built-in environment"):
+        store_config("PointGoal1", {"hazards_num": 3})  # make_env would make the built-in one
 
 
 @pytest.mark.parametrize(

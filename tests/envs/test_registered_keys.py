@@ -3,6 +3,7 @@
 import pickle
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
@@ -44,7 +45,7 @@ def test_registered_keys_are_keys_like_the_others():
     rows = {row.name: row for row in key_table()}
     assert rows["mines_num"].values == "a whole number from 0 to 1,000"
     assert rows["mines_size"].values.startswith("a number above 0")
-    config = SafetyGymConfig(**POINT, mines_num=2)
+    config = SafetyGymConfig(**POINT, mines_num=torch.tensor(2))
     assert (config.mines_size, config.mines_keepout, config.mines_cost) == (0.2, 0.3, 2.5)
     assert pickle.loads(pickle.dumps(config)) == config
     assert hash(pickle.loads(pickle.dumps(config))) == hash(config)

@@ -153,6 +153,8 @@ def test_what_cannot_be_made_is_said(keys, message):
 def test_only_what_was_imported_is_reached(trusted):
     with pytest.raises(ConfigError, match="one number per row"):
         make_env(PENDULUM | {"cost": "torchrl_envs:wrong"}, num_envs=2)
+    with pytest.raises(ConfigError, match="called cost_<kind>, not 'th'"):  # it would replace th
+        make_env(PENDULUM | {"cost": {"_target_": "torchrl_envs.wrong", "th": 1}}, num_envs=2)
     with pytest.raises(TargetError, match=r"env\.cost=os\.getcwd.*import=os"):
         make_env(PENDULUM | {"cost": "os:getcwd"})
     with pytest.raises(TargetError, match=r"env\.id=torchrl\.envs.*import=torchrl\.envs"):

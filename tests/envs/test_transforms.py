@@ -10,7 +10,7 @@ from torchrl.envs.transforms import RewardScaling, StepCounter
 from torchrl.envs.utils import check_env_specs
 from transforming import ENVIRONMENTS, SAUTE, TRANSFORMS, Priced, half_speed, still, transformed
 
-from safe_rl.envs import ConstrainedEnv, check_constrained_env, make_env
+from safe_rl.envs import ConfigError, ConstrainedEnv, check_constrained_env, make_env
 from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
@@ -228,6 +228,8 @@ def test_nodes_are_built_and_their_keys_named():
     loss["cost_limits"] = {"cost": 25.0}
     with pytest.raises(TargetError, match="no Transform"):
         make_env({"robot_base": "point"}, transforms={"slow": loss})
+    with pytest.raises(ConfigError, match=r"'transforms' must map names .* got \['saute'\]"):
+        make_env({"robot_base": "point"}, transforms=["saute"])
 
 
 def filtered(function):

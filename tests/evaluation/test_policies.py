@@ -91,6 +91,8 @@ def test_an_exported_policy_is_the_policy(run, tmp_path):
 
 def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     assert export([str(run)]) == 2
+    assert export([str(run), str(tmp_path / "a.onx")]) == 1
+    assert "FILE.onnx, or a FOLDER" in capsys.readouterr().err
     assert export([str(run), str(tmp_path / "a.onnx"), "checkpoint=certified"]) == 1
     assert "error: " in capsys.readouterr().err
     assert not (tmp_path / "a.onnx").exists()

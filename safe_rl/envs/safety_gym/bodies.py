@@ -6,8 +6,9 @@ import math
 
 import mujoco
 
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.elements import NUM_RAY_GROUPS, Element, Motion
+from safe_rl.envs.safety_gym.elements import NUM_RAY_GROUPS, Element, Geom, Motion
 from safe_rl.envs.safety_gym.tasks import goal_is_button
 
 FLOOR_HALF_SIZE = 3.5  # visible part [m]; the plane itself is infinite
@@ -74,7 +75,10 @@ def _add_geoms(
 ) -> None:
     """Add an element's shapes; they inherit the robot file's defaults (condim, density)."""
     ghost = ghost or element.motion is Motion.VIRTUAL
-    for shape in element.geoms(config):
+    shapes = element.geoms(config)
+    if isinstance(shapes, Geom):
+        raise ConfigError(f"'geoms' of '{element.kind}' must return a tuple of Geoms, got a Geom.")
+    for shape in shapes:
         geom = body.add_geom(spec.default, type=shape.type, pos=shape.pos, group=element.group)
         geom.size[: len(shape.size)] = shape.size
         geom.rgba = [*element.rgb, 0.25 if ghost else 1.0]

@@ -65,6 +65,8 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
             add_bodies(spec, config, element, decorated)
         contact_names = _add_sensors(spec, config, present)
         model = spec.compile()
+    except ConfigError:
+        raise
     except ValueError as error:
         raise ConfigError(
             f"MuJoCo cannot build the world of 'robot_base' {config.robot_base}: {error}. If a "

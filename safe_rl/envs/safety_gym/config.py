@@ -61,7 +61,7 @@ class SafetyGymConfig(Vocabulary):
         """Return the default of a key that was registered after this configuration was made."""
         if name in _keys:
             return _keys[name].default
-        raise AttributeError(f"A SafetyGymConfig has no attribute '{name}'.")
+        raise AttributeError(f"There is no configuration key '{name}'.{nearest(name, _keys)}")
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"A configuration cannot be changed: use replace({name}=…).")

@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-
 from safe_rl.envs.errors import ConfigError
 from safe_rl.ranges import Range, Values, values_of
 
@@ -75,9 +73,9 @@ def coerce(name: str, key: Key, value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Return NumPy's scalars as Python's, and lists and other iterables as tuples."""
-    if isinstance(value, np.generic):
-        return value.item()
+    """Return numbers of NumPy and torch as Python's, and their arrays, lists, … as tuples."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
         return value
     return tuple(map(_plain, value))

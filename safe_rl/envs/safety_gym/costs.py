@@ -128,7 +128,7 @@ def compute_costs(
     Worlds whose physics failed, bool [N], have no cost but `cost_exception` (and the aggregate).
 
     Raises:
-        ConfigError: If a registered cost is not one number of at least 0 per world.
+        ConfigError: If a registered cost is not one finite number of at least 0 per world.
     """
     magnitudes = [world.require(row.key, row.magnitude(config, world)) for row in rows]
     if world.physics.maybe_any(failed):
@@ -136,15 +136,19 @@ def compute_costs(
     exceptions = failed.to(world.physics.dtype)  # determines the dtype of the sum
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     if any(row.key not in BUILT_IN for row in rows):
-        # this also finds NaN, which would be 0 after `gt_`
-        world.physics.check(~(costs >= 0.0), partial(_wrong_cost, rows, costs.clone()))
+        # NaN would be 0 after `gt_`, and infinity 1
+        world.physics.check(~_allowed(costs), partial(_wrong_cost, rows, costs.clone()))
     return costs.gt_(0.0) if config.constrain_indicator else costs
+
+
+def _allowed(costs: Tensor) -> Tensor:
+    return (costs >= 0.0) & (costs < math.inf)
 
 
 def _wrong_cost(rows: Sequence[Cost], costs: Tensor) -> ConfigError:
     """Return an error that names the first wrong cost; the first row, the sum, is left out."""
-    lowest = costs.amin(-1)
-    number = 1 + int((~(lowest[1:] >= 0.0)).nonzero()[0])
-    wrong = float(lowest[number])
-    hint = "give every world a number" if math.isnan(wrong) else "clamp(min=0) it"
-    return ConfigError(f"{cost_keys(rows)[number]} must be 0 or more, got {wrong:.4g}: {hint}.")
+    number, world = (~_allowed(costs[1:])).nonzero()[0]
+    wrong = float(costs[1 + number, world])
+    hint = "clamp(min=0) it" if wrong < 0 else "give every world a finite number"
+    key = cost_keys(rows)[1 + number]
+    return ConfigError(f"{key} must be 0 or more and finite, got {wrong:.4g}: {hint}.")

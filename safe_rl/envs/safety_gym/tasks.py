@@ -152,17 +152,16 @@ def dense_reward(
     """Return the reward [N] without the bonus for a goal, clipped to ±`reward_clip`.
 
     Raises:
-        ConfigError: If a registered task's reward has a wrong shape or is NaN.
+        ConfigError: If a registered task's reward has a wrong shape or is not finite.
     """
     reward = world.require(
         f"'reward' of task '{config.task}'", task.reward(config, world, before, now)
     )
     if config.task not in BUILT_IN:
         error = ConfigError(
-            f"'reward' of task '{config.task}' is NaN, from which nothing can be learned: return "
-            "a number for every world."
+            f"'reward' of task '{config.task}' is NaN or infinite: return a number for every world."
         )
-        world.physics.check(reward.isnan() & ~failed, lambda: error)
+        world.physics.check(~(reward.isfinite() | failed), lambda: error)
     if config.reward_orientation:
         reward = reward + config.reward_orientation_scale * world.up
     if config.reward_clip:

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.costs import COST, parse_ranges
+from safe_rl.envs.costs import COST, is_cost, parse_ranges
 from safe_rl.envs.errors import ConfigError, nearest
 from safe_rl.targets import locate
 
@@ -85,7 +85,10 @@ class StepCosts(Transform):
             found.append((name, (value < kept.low) | (value > kept.high)))
         if self._function is not None:
             returned = self._function(step)
-            found += returned.items() if isinstance(returned, Mapping) else [(COST, returned)]
+            named = returned if isinstance(returned, Mapping) else {COST: returned}
+            if wrong := [name for name in named if not is_cost(name)]:
+                raise ConfigError(f"env.cost: costs are called cost_<kind>, not '{wrong[0]}'.")
+            found += named.items()
         costs: dict[str, Tensor] = {}
         for name, cost in found:
             if name in costs:

@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.targets import TargetError, build
 
@@ -167,6 +168,11 @@ def transform_env(
         >>> transform_env(env, {"slow": slow}, evaluating=False).cost_keys[-1]
         'cost_interventions'
     """
+    if not isinstance(transforms, Mapping):
+        raise ConfigError(
+            "'transforms' must map names to transforms, such as {'slow': ActionFilter(…)}, got "
+            f"{transforms!r}."
+        )
     made = {name: _transform(name, given) for name, given in transforms.items()}
     for transform in made.values():
         if isinstance(transform, ConstraintTransform):
