@@ -26,7 +26,7 @@ from safe_rl.cli.grammar import CommandLineError, overrides_of, parse
 from safe_rl.cli.schema import GIVEN_WHOLE, KEYS, check_settings, plain, unknown_key, unread_by
 from safe_rl.cli.user_code import check_imports, note_imports
 from safe_rl.envs import complete_env, store_configs
-from safe_rl.envs.families import hint_of_gymnasium
+from safe_rl.envs.families import GROUP, env_names, hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, read_config, read_yaml
 from safe_rl.naming import did_you_mean
@@ -98,12 +98,28 @@ def resolving(config: DictConfig) -> Iterator[None]:
 
 
 def search_folders(folders: Iterable[str | Path]) -> list[str]:
-    """The override that adds existing folders to Hydra's search path; none without folders."""
+    """The override that adds folders to Hydra's search path; none without folders.
+
+    Raises:
+        CommandLineError: If a folder does not exist, or has a file that Hydra would not read.
+    """
     paths = [Path(folder).expanduser().absolute() for folder in folders]
     if missing := next((path for path in paths if not path.is_dir()), None):
         raise CommandLineError(f"config_dir={missing}: there is no such folder.")
+    if unread := next((file for path in paths for file in _hidden(path)), None):
+        raise CommandLineError(f"{unread}: there is a built-in file of this name: choose another.")
     found = [f"file://{path}" for path in paths]
     return list(overrides_of({"hydra.searchpath": found} if found else {}))
+
+
+def _hidden(folder: Path) -> Iterator[Path]:
+    """Files of a folder that are not read, because built-in ones of their names precede them."""
+    for file in CONF.rglob("*.yaml"):
+        own = folder / file.relative_to(CONF)
+        if own.is_file() and own.read_bytes() != file.read_bytes():
+            yield own
+    named = (folder / GROUP / f"{name}.yaml" for name in env_names())
+    yield from (own for own in named if own.is_file())
 
 
 def _check_form(overrides: Sequence[Override]) -> None:
@@ -195,6 +211,8 @@ def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
         words = " ".join(str(error).split())
         if missing := re.search(r"Missing mandatory value: (\S+)", words):
             words = f"{missing[1]} has to be given: {missing[1]}=…"
+        if nameless := re.search(r"key '(env|algo)\.name' not found", words):
+            words = f"the file of {nameless[1]}= needs a line 'name: …'"
         raise CommandLineError(words) from None
 
 

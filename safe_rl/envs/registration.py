@@ -67,7 +67,7 @@ class EnvironmentsSource(ConfigSource):
 
 
 class EnvironmentsSearchPath(SearchPathPlugin):
-    """Appends the source to the search path, so that a file precedes an environment of its name."""
+    """Appends the source to the search path; folders of --config-dir come after it."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         """Append the source."""

@@ -184,7 +184,7 @@ FAULTY = {
     "- 1": "algo/mine': ",
     "loss: {a: 1\nb: 2": r"mine\.yaml\", line 3",
     "frames: ${a": "full_key: frames",
-    "frames: 3": r"algo\.name' not found",
+    "frames: 3": "the file of algo= needs a line 'name: …'",
 }
 
 
@@ -219,14 +219,20 @@ def test_folders_of_ones_own_are_searched_too(own_conf, flag):
             read_command([folder, *choice, wrong])
 
 
-def test_a_folder_that_is_not_there():
+def test_a_folder_that_is_not_there_or_not_read(tmp_path):
     with pytest.raises(CommandLineError, match="no such folder"):
         read_command(["--config-dir", "nowhere"])
+    for file in ("env/CarGoal1.yaml", "algo/cpo.yaml"):  # of the same names as built-in ones
+        (tmp_path / file).parent.mkdir()
+        (tmp_path / file).write_text("name: mine")
+        with pytest.raises(CommandLineError, match=f"{file}: there is a built-in file"):
+            read_command([f"--config-dir={tmp_path}"])
+        (tmp_path / file).unlink()
 
 
 def test_every_value_of_a_sweep_is_checked():
-    for wrong in ("lagrangian.kp=0.1,nan", "+lr=1,2", "env=CarGoal2,CarGaol2"):
-        with pytest.raises(ValueError, match=r"kp=nan|there is no key 'lr'|'CarGoal2'"):
+    for wrong in ("lagrangian.kp=0.1,nan", "+lr=1,2", "env=CarGoal2,CarGaol2", "hydra.run.dir=x"):
+        with pytest.raises(ValueError, match=r"kp=nan|no key 'lr'|'CarGoal2'|write hydra\.sweep"):
             read_command(["-m", "seed=0,1", wrong])
 
 
