@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
-from registrations import disc, register_mines, undone
+from registrations import cube, disc, register_mines, undone
 from run_configs import CONF
 
 from safe_rl.envs import (
@@ -74,29 +74,23 @@ def test_hydra_knows_registered_keys_and_configurations():
         compose_env("env=PointMines", "env.mine_num=4")
 
 
+def cost(magnitude, **others):
+    register_cost(Cost("cost_mines", bool, magnitude, **others))
+
+
+MINE = disc("mines", "mine")
 WRONG = {
     "a built-in element": (lambda: register_element(disc("vases", "jug")), "'vases'.*built-in"),
-    "a goal that is missing": (
-        lambda: register_task("visit", Task(max, met=lambda c, w, now: now[:, 0] < 1)),
-        "'visit'.*'goal'",
-    ),
+    "no goal": (lambda: register_task("visit", Task(max, met=max)), "'visit'.*'goal'"),
     "many of a kind": (lambda: register_task("new", Task(max, elements=("vases",))), "'vases_num'"),
-    "contacts with nothing known": (
-        lambda: register_cost(Cost("cost_mines", bool, max, touches=("pilars",))),
-        "'pilars'.*'pillars'",
-    ),
-    "a kind without its tuple": (
-        lambda: register_cost(Cost("cost_mines", bool, max, touches="pillars")),
-        r"'pillars' is a text: .*\('pillars',\)",
-    ),
-    "a built-in key": (
-        lambda: register_element(disc("mines", "mine"), keys={"num_steps": 3}),
-        "'num_steps'.*taken",
-    ),
-    "a default of the wrong type": (
-        lambda: register_element(disc("mines", "mine"), keys={"mines_num": "many"}),
-        "'mines_num'.*whole number",
-    ),
+    "contacts with nothing": (lambda: cost(max, touches=("pilars",)), "'pilars'.*'pillars'"),
+    "a kind without its tuple": (lambda: cost(max, touches="pillars"), r"a text: .*\('pillars',\)"),
+    "no function": (lambda: cost(1.0), "'magnitude' must be .* got 1.0"),
+    "motion": (lambda: register_element(cube("a", "b", "free")), r"'motion' must .*\.FREE or"),
+    "one object": (lambda: register_element(disc("oil", "oil"), {"oil_num": 2}), "only one object"),
+    "next goal": (lambda: register_task("a", Task(max, next_goal="button")), "NextGoal.* got 'but"),
+    "a built-in key": (lambda: register_element(MINE, {"num_steps": 3}), "'num_steps'.*taken"),
+    "a wrong default": (lambda: register_element(MINE, {"mines_num": "a"}), "'mines_num'.*whole"),
 }
 
 
