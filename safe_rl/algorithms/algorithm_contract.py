@@ -20,8 +20,6 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.ranges import Checked
 from safe_rl.resumable import Resumable
 
-__all__ = ["Algorithm", "PolicyUpdate", "Recipe", "SequentialUpdates", "Stateful", "states_of"]
-
 
 class Stateful(Protocol):
     """Anything with a ``state_dict``."""

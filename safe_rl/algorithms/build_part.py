@@ -19,8 +19,6 @@ from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, chec
 from safe_rl.parameters import accepted_names
 from safe_rl.targets import TargetError, build, locate
 
-__all__ = ["build_constraints", "build_part", "build_update", "constrained_limits", "find_recipe"]
-
 Update = TypeVar("Update")
 
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"

@@ -16,8 +16,6 @@ from safe_rl.objectives.risk import Charges, RiskMeasure
 from safe_rl.ranges import is_number
 from safe_rl.resumable import Resumable
 
-__all__ = ["CHARGES", "Constraints", "TrackedConstraints", "check_cost_limits"]
-
 
 class Constraints(Resumable):
     """Constraints of an algorithm: cost keys, limits d, violations J_c − d, and the multiplier.

@@ -16,8 +16,6 @@ from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import constraint_value
 from safe_rl.ranges import Positive
 
-__all__ = ["CPOStep", "PCPOStep", "nearest_feasible"]
-
 #: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
 _NO_GRADIENT = 1e-8
 

@@ -14,8 +14,6 @@ from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 
-__all__ = ["fill_replay_buffer"]
-
 
 def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tuple[str, bool]:
     """Fill an empty replay buffer with the dataset of a configuration, if it has one.

@@ -15,10 +15,6 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-__all__ = [
-    *("ESTIMATOR", "LossState", "divergence", "estimates_read", "reported_kl", "sum_of_losses")
-]
-
 ESTIMATOR = "_value_estimator."
 """Prefix of buffers of value estimators: settings that a resumed run may change."""
 

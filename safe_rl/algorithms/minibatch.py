@@ -24,8 +24,6 @@ from safe_rl.objectives.samples import learning_samples, mask_keys, require_fini
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.ranges import PART, Count, Positive, Range, Share
 
-__all__ = ["KLAdaptiveRate", "MinibatchUpdate"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class KLAdaptiveRate:

@@ -35,8 +35,6 @@ from safe_rl.models import ExploringPolicy
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
 
-__all__ = ["OffPolicy"]
-
 _UNUSED = {
     "advantage": "It learns values of single transitions, not advantages of batches: the discount "
     "is loss.gamma, and memory.n_steps says how many steps a transition spans.",

@@ -14,8 +14,6 @@ from safe_rl.algorithms.build_part import build_part
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
 
-__all__ = ["bounded_actions", "build_networks", "exploring", "setting"]
-
 _ON_POLICY_ONLY = ("encoders", "memory", "normalise")
 
 

@@ -35,8 +35,6 @@ from safe_rl.objectives import CriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
 
-__all__ = ["OnPolicy"]
-
 
 @dataclass
 class OnPolicy(Algorithm, Recipe):

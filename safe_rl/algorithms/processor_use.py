@@ -13,8 +13,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.processor import cpuinfo
 
-__all__ = ["fast_products", "in_parallel", "prefers_onednn", "torch_threads"]
-
 
 def prefers_onednn(cpuinfo: str) -> bool:
     """Whether oneDNN multiplies matrices faster than MKL on a processor, and as exactly.

@@ -13,8 +13,6 @@ from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.ranges import Fraction, NotNegative
 
-__all__ = ["CRPOStep", "CTRPOStep", "barrier_divergence"]
-
 
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
     """Bregman divergence, for x log x, between two distances of a cost to its limit.

@@ -18,8 +18,6 @@ from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.ranges import Checked, Count, Range, Share
 from safe_rl.resumable import Resumable
 
-__all__ = ["Memory", "ProportionalSampler"]
-
 _MOST_AT_ONCE = 16_384
 """Largest number of transitions that are sampled in one call and then cut into minibatches."""
 _LONGEST_ROW = 1_000

@@ -18,8 +18,6 @@ from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.ranges import PART, Checked, Positive, Range
 
-__all__ = ["ReplayUpdate"]
-
 
 class ReplayUpdate(Checked):
     """Minimise the sum of all ``loss_*`` on minibatches, and update target networks.

@@ -17,8 +17,6 @@ from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Multiplier
 from safe_rl.resumable import Resumable
 
-__all__ = ["ConstraintHook", "UpdateStepper"]
-
 
 class ConstraintHook(Resumable, TrainerHookBase):
     """Updates the constraints, and with them the multiplier, with every collected batch.

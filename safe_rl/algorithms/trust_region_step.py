@@ -30,8 +30,6 @@ from safe_rl.objectives.trust_region import (
 from safe_rl.objectives.violation import matched_violation
 from safe_rl.ranges import Fraction, NotNegative, Positive, Range
 
-__all__ = ["Loss", "Proposal", "StepProblem", "TRPOStep", "total_loss"]
-
 Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
 

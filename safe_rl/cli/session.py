@@ -24,6 +24,7 @@ from safe_rl.cli.evaluating import certify_run
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
 from safe_rl.cli.schema import check_settings, plain
 from safe_rl.cli.user_code import imported, make_after_imports
+from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import transforms_of
@@ -34,7 +35,7 @@ from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.outcome import final_figures, violation
 from safe_rl.runs.table import TableError, read_table
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
-from safe_rl.training.trainer import EpisodeError, Trainer, WorkerError
+from safe_rl.training.trainer import Trainer
 
 SETTING_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, CheckpointError, OmegaConfBaseException, OSError, ModuleNotFoundError),

@@ -12,8 +12,6 @@ from torch import Tensor
 from safe_rl.naming import STEPS_TAKEN, key_name
 from safe_rl.resumable import Resumable
 
-__all__ = ["EpisodeAccounting", "EpisodeError", "EpisodeStatistics"]
-
 
 class EpisodeError(ValueError):
     """Steps that break the rules of a constrained problem; the message says which."""

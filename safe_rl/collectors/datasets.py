@@ -14,8 +14,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from safe_rl.collectors.recording import PARTIAL, read_recording
 from safe_rl.extras import import_extra
 
-__all__ = ["read_dataset", "read_hdf5", "safe_episodes"]
-
 Arrays = dict[NestedKey, np.ndarray]
 
 _NAMES: dict[NestedKey, str] = {

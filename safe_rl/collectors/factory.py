@@ -18,8 +18,6 @@ from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
 from safe_rl.ranges import Options, Range
 
-__all__ = ["make_collector", "make_process_collector", "make_ray_collector"]
-
 
 def make_collector(
     env: EnvBase,

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from safe_rl.files import check_no_links, load_tensors, save_tensors
 
-__all__ = ["PARTIAL", "Recording", "StepRecorder", "read_recording"]
-
 PARTIAL = "partial"
 """Entry [N, T, 1] bool, true in at least one step of an episode that is not recorded completely."""
 

@@ -23,8 +23,6 @@ from torchrl.envs import EnvBase
 
 from safe_rl.processes import leave_signals_to_parent
 
-__all__ = ["MakeEnv", "Makers", "WorkerCollector", "WorkerError", "split_rows"]
-
 
 class MakeEnv(Protocol):
     """Function, called in workers, that makes the run's environment with fewer rows."""

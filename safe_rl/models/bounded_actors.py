@@ -16,8 +16,6 @@ from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
 from safe_rl.models.heads import Shape, action_sampler
 from safe_rl.models.input_scales import InputScale
 
-__all__ = ["SquashedNormal", "make_bounded_actor", "make_squashed_actor"]
-
 _SCALE_FLOOR = 1e-3
 
 

@@ -23,8 +23,6 @@ from safe_rl.models.heads import AUTO, Head, make_head
 from safe_rl.models.input_scales import RunningScale, input_scale_vector
 from safe_rl.models.networks import Chain, Tanh, assemble_actor, perceptron
 
-__all__ = ["build_networks"]
-
 _AS_IT_IS: Mapping[str, Any] = {"vector": []}
 
 

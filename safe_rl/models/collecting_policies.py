@@ -13,8 +13,6 @@ from torchrl.modules import IndependentNormal
 
 from safe_rl.models.networks import Chain
 
-__all__ = ["WITHOUT_NOISE", "BehaviourPolicy", "ExploringPolicy", "make_behaviour"]
-
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
     """Return a `BehaviourPolicy` of an actor, which is faster, or the actor itself."""

@@ -15,12 +15,6 @@ from torchrl.modules import ConvNet, GRUModule, set_recurrent_mode
 from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector
 from safe_rl.models.networks import Tanh, perceptron
 
-__all__ = [
-    *("FEATURES", "FIRST", "RECURRENT", "TO_FLATTEN", "Body", "Entry", "Observed"),
-    *("RecurrentLayer", "observed_entries"),
-]
-
-
 TO_FLATTEN = (
     "make the environment flatten them: with env.observation_flatten=true in Safety Gym, else with "
     "env.flatten=true"

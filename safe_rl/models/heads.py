@@ -25,11 +25,6 @@ from torchrl.data import (
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
-__all__ = [
-    *("AUTO", "HEADS", "BoundedBeta", "Head", "Shape", "action_sampler", "choices"),
-    *("gaussian_head", "make_head"),
-]
-
 AUTO = "auto"
 Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 

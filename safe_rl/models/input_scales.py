@@ -8,8 +8,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
-__all__ = ["InputScale", "RunningScale", "input_scale_vector", "take_in"]
-
 
 class InputScale(nn.Module):
     """Multiply the input by a fixed vector, so that all its components have similar ranges.

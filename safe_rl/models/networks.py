@@ -18,9 +18,6 @@ from safe_rl.models.heads import Head, action_sampler, gaussian_head
 from safe_rl.models.input_scales import InputScale
 from safe_rl.processor import cpuinfo
 
-__all__ = ["Chain", "Tanh", "assemble_actor", "make_actor", "make_critic", "perceptron"]
-
-
 _MKL_IS_QUICK = torch.backends.mkl.is_available() and "GenuineIntel" in cpuinfo()
 """Whether torch computes the tanh by vector instructions of MKL, which MKL uses in full width on
 Intel's processors only. It then takes a third of the time of `_tanh`."""

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 
 from safe_rl.models.input_scales import InputScale
 
-__all__ = ["EnsembleMLP", "QEnsemble"]
-
 Layers = Sequence[tuple[Tensor, Tensor]]
 
 

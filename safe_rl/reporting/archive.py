@@ -24,8 +24,6 @@ from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
 from safe_rl.runs.table import read_table
 
-__all__ = ["ROWS", "RUNS", "archive_runs", "find_runs", "read_archive", "write_archive"]
-
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
 
 

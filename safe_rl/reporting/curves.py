@@ -19,11 +19,6 @@ from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import final_width
 from safe_rl.scores.comparisons import bootstrap
 
-__all__ = [
-    *("Average", "average", "drawn_keys", "draw_experiment", "draw_learning_curves"),
-    *("draw_small_multiples", "limits_of", "set_axes"),
-]
-
 _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
 _NUM_MARKERS = 6  # of a curve
 _ROW_HEIGHT = 2.4  # of a row of panels [inch]

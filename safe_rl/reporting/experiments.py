@@ -14,10 +14,6 @@ from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
 
-__all__ = [
-    *("PACKAGED", "Experiment", "cost_keys_of", "distinguishing_keys", "group_runs", "title_of"),
-]
-
 PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 """Names of the package's algorithms."""
 

@@ -21,11 +21,6 @@ from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import Estimate, pareto_front
 
-__all__ = [
-    *("LIMIT_STYLE", "WIDTH", "Style", "add_legend", "algorithm_styles", "compared"),
-    *("draw_fronts", "draw_variations", "literal", "set_grid"),
-]
-
 # colours and markers of the package's algorithms; those of the paper come first, in colours of
 # Okabe and Ito that colour-blind readers can distinguish
 _LOOKS = (

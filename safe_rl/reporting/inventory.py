@@ -10,8 +10,6 @@ from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval
 
-__all__ = ["certificate_table", "duration", "evaluation_table", "run_table"]
-
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
 

@@ -27,8 +27,6 @@ from safe_rl.reporting.tables import Table, clean, short_number
 from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import Suite
 
-__all__ = ["Block", "Drawing", "Report", "Section", "build_report", "write_report"]
-
 _MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed page
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))

@@ -17,8 +17,6 @@ from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation
 
-__all__ = ["Run", "read_certificate", "read_code", "read_evaluation", "select"]
-
 
 @dataclass(frozen=True)
 class Run:

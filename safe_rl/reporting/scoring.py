@@ -17,11 +17,6 @@ from safe_rl.scores import benchmark, measures
 from safe_rl.scores.benchmark import Normalised
 from safe_rl.scores.comparisons import interquartile_mean
 
-__all__ = [
-    *("complete_slates", "final_record", "final_table", "learning_table", "normalised_scores"),
-    "slate_table",
-]
-
 _SYMBOLS = dict(
     zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
 )

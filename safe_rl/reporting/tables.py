@@ -14,11 +14,6 @@ from matplotlib.ticker import EngFormatter
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 
-__all__ = [
-    *("Cell", "Record", "Table", "clean", "each_cost", "filled", "interval", "mark_best"),
-    *("short_number", "spread"),
-]
-
 Record = Mapping[str, Any]
 _LATEX = str.maketrans(
     {character: rf"\{character}" for character in "&%$#_{}"}

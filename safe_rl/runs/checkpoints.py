@@ -19,8 +19,6 @@ from safe_rl.algorithms.algorithm_contract import Stateful, states_of
 from safe_rl.files import load_tensors, save_tensors
 from safe_rl.runs.folder import RunFolder, checkpoint_name, checkpoint_steps, checkpoints_in
 
-__all__ = ["CheckpointStore", "best_checkpoint", "is_finished", "read_facts", "read_states"]
-
 
 def read_facts(path: Path) -> dict[str, Any]:
     """The facts that a checkpoint was written with, without reading its tensors.

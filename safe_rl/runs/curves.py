@@ -16,8 +16,6 @@ from matplotlib.transforms import ScaledTranslation
 from safe_rl.files import replacing
 from safe_rl.runs.outcome import final_width, judges_another_measure
 
-__all__ = ["learning_curves", "moving_mean", "point_marker", "save_figure"]
-
 _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
 
 

@@ -13,8 +13,6 @@ from tqdm import tqdm
 
 from safe_rl.runs.outcome import final_figures, final_rows, measured
 
-__all__ = ["LINE_SECONDS", "ProgressBar", "outcome_line", "shown"]
-
 LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
 """Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 

@@ -20,11 +20,6 @@ from filelock import FileLock, Timeout
 
 from safe_rl.files import check_no_links
 
-__all__ = [
-    *("KINDS", "RunFolder", "RunInUseError", "checkpoint_name", "checkpoint_steps"),
-    *("checkpoints_in", "common_source", "lock_folder", "paths_below", "run_of", "runs_below"),
-]
-
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""

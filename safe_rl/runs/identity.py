@@ -16,11 +16,6 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.files import read_config, read_yaml
 from safe_rl.runs.folder import RunFolder, common_source
 
-__all__ = [
-    *("ROLES", "Role", "check_same_run", "differences", "experiment_of", "flatten"),
-    *("given_settings", "role_of"),
-]
-
 
 class Role(Enum):
     """The purpose of a key.

@@ -22,8 +22,6 @@ from safe_rl.files import replace_text
 from safe_rl.ranges import Text
 from safe_rl.runs.folder import RunFolder
 
-__all__ = ["MLflowLogger", "ResumableLogger", "TensorboardLogger", "WandbLogger"]
-
 
 class ResumableLogger:
     """Methods that a run calls besides ``log_scalar``: a second base class of loggers."""

@@ -9,11 +9,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import fmean
 
-__all__ = [
-    *("FINAL_EPOCHS", "FINAL_STEPS", "feasible_return", "final_figures", "final_rows"),
-    *("final_width", "judges_another_measure", "keeps", "mean_row", "measured", "violation"),
-]
-
 FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
 

@@ -21,8 +21,6 @@ from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.targets import build
 
-__all__ = ["RunRecord", "code_of", "commit_of", "note_code"]
-
 
 class RunRecord:
     """Configuration, table, logger, learning curves and progress bar of one run.

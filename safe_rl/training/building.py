@@ -30,8 +30,6 @@ from safe_rl.runs.record import RunRecord
 from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer
 
-__all__ = ["begin_from", "build_trainer", "physics_threads", "seed_everything"]
-
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes the periodic evaluation of a policy that is trained."""
 

@@ -12,8 +12,6 @@ from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.resumable import Resumable
 from safe_rl.runs.outcome import feasible_return
 
-__all__ = ["Candidates", "Judged", "epochs_until_judged"]
-
 # most epochs to wait: waiting policies are in main memory and in every checkpoint
 _LONGEST = 10
 

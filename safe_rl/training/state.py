@@ -17,8 +17,6 @@ from torchrl.envs import EnvBase
 
 from safe_rl.resumable import Resumable
 
-__all__ = ["Progress", "StopRequest", "WorldSnapshot"]
-
 
 class Progress(Resumable):
     """Counters of a run: epochs, environment steps, seconds of training.

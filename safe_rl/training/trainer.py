@@ -18,18 +18,14 @@ from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import (
     EpisodeAccounting,
-    EpisodeError,
     Recording,
     WorkerCollector,
-    WorkerError,
 )
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
-
-__all__ = ["EpisodeError", "Evaluator", "Trainer", "WorkerError"]
 
 # Parts that only the newest checkpoints hold, for resuming: a replay buffer has gigabytes, the
 # others are several times as large as a policy.
