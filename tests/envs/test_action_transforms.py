@@ -114,6 +114,14 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     assert steps["terminated"][..., 0].tolist() == [[True, True], [False, False]]
     assert steps["truncated"][..., 0].tolist() == [[False, False], [False, True]]
     assert (env.max_episode_steps, env.steps_per_decision) == (8, 4)
+    # rows of a stateless environment, of which one goes on
+    node = {"_target_": "safe_rl.envs.torchrl.make_torchrl", "id": "PendulumEnv", "num_steps": 8}
+    node["outside"] = {"cost_fast": ["thdot", -2, 2]}
+    single, env = make_env(node, num_envs=3, seed=1), make_env(node, num_envs=3, seed=1)
+    env = transformed(env, end=EarlyTermination({"cost": 0.0}), repeat=ActionRepeat(4))
+    once, steps = still(env, 1)["next"][:, 0], still(single, 4)["next"]
+    assert once["steps_taken"][:, 0].tolist() == [2, 4, 3]
+    assert torch.equal(once["observation"][1], steps["observation"][1, -1])
 
 
 def test_evaluation_counts_steps_of_the_environment():

@@ -67,5 +67,5 @@ def transformed(env, *names, evaluating=False, seed=None, **others):
 
 def still(env, steps, action=0.0):
     """Rollout of a point that does nothing, over the ends of episodes."""
-    chosen = torch.full((*env.batch_size, 2), action)
+    chosen = torch.full(env.action_spec.shape, action)
     return env.rollout(steps, lambda td: td.set("action", chosen), break_when_any_done=False)

@@ -7,7 +7,7 @@ from inspect import signature
 from typing import Annotated, Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
@@ -188,11 +188,9 @@ class ActionRepeat(ConstraintTransform):
             active = ~result.get("done")
             if not active.any():
                 break
-            # a stateless environment reads its state from the last step
-            state = tensordict.clone(False).update(result)
-            if not active.all():
-                # an environment may refuse steps after an end; these steps are not counted
-                state.update(env.reset(TensorDict(_reset=~active, batch_size=env.batch_size)))
+            # A stateless environment reads its state from the last step. Others may refuse steps
+            # after an end, so rows that have ended begin an episode whose steps are not counted.
+            state = env.maybe_reset(tensordict.clone(False).update(result))
             after = env._step(state.set("action", tensordict.get("action")))
             after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
             taken += active
