@@ -86,7 +86,7 @@ def test_without_a_seed_torch_decides(name):
     assert torch.equal(*seeded)
 
 
-@pytest.mark.parametrize("name", [*NAMES, "nested"])
+@pytest.mark.parametrize("name", [*NAMES, "nested", "one layout"])
 def test_a_state_determines_the_future_and_setting_it_interrupts_nothing(name):
     """Through new goals and resets; also in another instance, and in copies."""
     plain, interrupted = make(name, 4, sleep=False), make(name, 4, sleep=False)

@@ -57,8 +57,9 @@ class SafetyGymEnv(SimulatedEnv):
 
     A state has `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
     `buttons_timer`, `step_count`, and keys that may be missing in a state that is set: `ctrl`,
-    `act`, `history`, `target_quat`, `layout`, `start_pose`, `seed` and `episode`. `set_state` wakes
-    sleeping bodies; with `sleep` False the continuation is identical to the last digit.
+    `act`, `history`, `target_quat`, `layout`, `start_pose`, `fixed_layout`, `seed` and `episode`.
+    `set_state` wakes sleeping bodies; with `sleep` False the continuation is identical to the last
+    digit.
 
     The cameras of pictures are "fixedfar", "fixednear", "track" (behind the robot), "vision" (the
     robot's) and "free" (above). Pictures also show lidar halos.
@@ -240,10 +241,14 @@ class SafetyGymEnv(SimulatedEnv):
         return TensorDict(places, self.batch_size).clone().to(self.device)
 
     def _read_state(self) -> TensorDict:
-        return read_state(self._world)
+        state = read_state(self._world)
+        if not self.config.randomize_layout:
+            state["fixed_layout"] = self._fixed_layout.expand(self.batch_size).clone()
+        return state
 
     def _write_state(self, state: TensorDictBase) -> None:
         check_worlds(self._world, self.get_state(), state)
+        self._fixed_layout = state.get("fixed_layout", self._fixed_layout).clone()
         if "layout" not in state and not self._episode.any():
             self.reset()
         write_state(self._world, state)

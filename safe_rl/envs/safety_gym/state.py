@@ -136,8 +136,9 @@ def point_goal_at_button(world: World, mask: Tensor) -> None:
 PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
+SEED_KEYS = ("fixed_layout", "seed", "episode")  # of the environment, not of its worlds
 # Without the last control, sensors that depend on actuators differ until the next step.
-OPTIONAL_KEYS = (*LAYOUT_KEYS, "target_quat", "ctrl", "act", "history", "seed", "episode")
+OPTIONAL_KEYS = (*LAYOUT_KEYS, *SEED_KEYS, "target_quat", "ctrl", "act", "history")
 
 
 def _stored(world: World) -> dict[str, Tensor]:
