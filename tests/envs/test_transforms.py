@@ -121,6 +121,9 @@ def test_a_scaled_reward_is_torchrls_and_returns_are_the_own_ones():
     theirs = rewards_of(TransformedEnv(Priced(costs), RewardScaling(0.0, 0.25)))
     torch.testing.assert_close(batch["reward"], theirs["reward"])
     assert torch.equal(batch[env.return_key], own)
+    # a step does not keep the reward that the last one has left in its TensorDict
+    again = env.step(env.step(env.reset().set("action", torch.full((2, 2), -0.5))))["next"]
+    assert torch.equal(0.25 * again[env.return_key], again["reward"])
     solved = transformed(Priced(costs), scale=RewardScale(0.25), evaluating=True)
     assert torch.equal(rewards_of(solved)["reward"], own)
 

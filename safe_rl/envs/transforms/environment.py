@@ -102,6 +102,10 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             # negative numbers, because environments fold with the number of the episode
             transform.seed(rng.fold(rows, -number))
 
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # TorchRL keeps entries of an earlier step that `base_env` does not write again
+        return super()._step(tensordict.exclude(("next", self.return_key)))
+
     def continue_from(self, steps: int) -> None:
         """Continue schedules after this number of steps per row, from the next reset on."""
         self.steps_before = steps
