@@ -135,7 +135,7 @@ def test_ids_of_the_velocity_family_make_what_gymnasium_checks(name):
     env = gymnasium.make(f"safe_rl.envs:{name}-v0")
     check_env(env.unwrapped, skip_render_check=True)
     assert env.spec.max_episode_steps == 1000
-    theirs = gymnasium.make(env.unwrapped.batch._robot.gymnasium_id)
+    theirs = gymnasium.make(f"{name.removeprefix('Safe').removesuffix('Velocity')}-v5")
     assert env.metadata["render_fps"] == theirs.unwrapped.metadata["render_fps"]
     assert env.observation_space.shape == theirs.observation_space.shape
     assert np.array_equal(env.action_space.low, theirs.action_space.low)

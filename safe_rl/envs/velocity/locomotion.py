@@ -66,6 +66,7 @@ def _inside(value: Tensor, interval: Interval | None) -> Tensor:
 
 
 # Whether a robot is healthy: configuration, positions [N, nq], velocities [N, nv] -> bool [N].
+# Robots that are not in `HEALTH` always are.
 def hopper(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
     """Torso high and upright, all other positions and velocities within bounds."""
     state = torch.cat([qpos[:, 2:], qvel], -1)

@@ -18,7 +18,7 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.pictures import Camera, Marker, Pictures
 from safe_rl.envs.velocity.locomotion import FORCES, PLACES, TORSO
-from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.runners import PARTS, RUNNERS
 from safe_rl.envs.velocity.velocity_config import VelocityConfig
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -51,8 +51,7 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
 
 def observed_parts(config: VelocityConfig) -> list[str]:
     """Fields of `MjData` that are observed besides positions and velocities, in order."""
-    parts = RUNNERS[config.robot].parts
-    return [part for part in parts if getattr(config, f"include_{part}_in_observation")]
+    return [part for part in PARTS if getattr(config, f"include_{part}_in_observation")]
 
 
 def needs_forces(config: VelocityConfig) -> bool:

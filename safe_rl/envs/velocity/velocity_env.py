@@ -79,12 +79,13 @@ class VelocityEnv(SimulatedEnv):
         super().__init__(num_envs, device, num_threads)
         self.config = resolve_velocity(env)
         self.cost_keys = ["cost", "cost_velocity"]
-        self._robot, self._model = RUNNERS[self.config.robot], load_model(self.config)
+        self._model = load_model(self.config)
         outputs = needed_outputs(self.config)
         self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
         self.seconds_per_step = self._physics.timestep * self.config.frame_skip
         self._observer = Observer(self.config, self._model)
-        self._place = PLACES[self._robot.place].reading(self._model, self._physics)
+        place = PLACES[RUNNERS[self.config.robot].place]
+        self._place = place.reading(self._model, self._physics)
         self._last_place = self._place()
         self._observation = torch.zeros(num_envs, self._observer.size)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
@@ -145,9 +146,9 @@ class VelocityEnv(SimulatedEnv):
 
     def _healthy(self) -> Tensor:
         """Return which robots are healthy, bool [N]."""
-        if self._robot.health is None:
+        if self.config.robot not in HEALTH:
             return torch.ones(self.batch_size, dtype=torch.bool)
-        return HEALTH[self._robot.health](self.config, self._physics.qpos, self._physics.qvel)
+        return HEALTH[self.config.robot](self.config, self._physics.qpos, self._physics.qvel)
 
     def _read_state(self) -> TensorDict:
         state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}
