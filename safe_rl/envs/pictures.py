@@ -121,3 +121,10 @@ def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
         rgba = np.array(marker.rgba, dtype=np.float32)
         mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size), marker.pos, upright, rgba)
         drawn.ngeom += 1
+
+
+def resize(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize a picture by the nearest pixels."""
+    lines = np.arange(height) * picture.shape[0] // height
+    columns = np.arange(width) * picture.shape[1] // width
+    return picture[lines[:, None], columns]

@@ -13,6 +13,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.errors import nearest
+from safe_rl.envs.pictures import resize
 from safe_rl.envs.torchrl.torchrl_env import TorchRLEnv
 
 __all__ = ["CostReader", "GymnasiumEnv"]
@@ -106,9 +107,7 @@ class GymnasiumEnv(TorchRLEnv):
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     """Resize with the same aspect ratio, into the upper left corner of [height, width, 3]."""
     scale = min(width / picture.shape[1], height / picture.shape[0])
-    lines, columns = (
-        (np.arange(max(1, int(scale * size))) / scale).astype(int) for size in picture.shape[:2]
-    )
+    lines, columns = (max(1, int(scale * size)) for size in picture.shape[:2])
     canvas = np.zeros((height, width, 3), dtype=np.uint8)
-    canvas[: len(lines), : len(columns)] = picture[lines[:, None], columns]
+    canvas[:lines, :columns] = resize(picture, columns, lines)
     return canvas

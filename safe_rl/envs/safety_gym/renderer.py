@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from torch import Tensor
 
-from safe_rl.envs.pictures import Camera, Marker
+from safe_rl.envs.pictures import Camera, Marker, resize
 from safe_rl.envs.safety_gym.bodies import VISION
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.display import Display
@@ -138,12 +138,5 @@ class WorldRenderer:
         width, height = config.vision_render_size
         largest_height, largest_width = (INSET_SHARE * side for side in frame.shape[:2])
         scale = min(1.0, largest_width / width, largest_height / height)
-        inset = _resize(seen, max(1, round(scale * width)), max(1, round(scale * height)))
+        inset = resize(seen, max(1, round(scale * width)), max(1, round(scale * height)))
         frame[: inset.shape[0], : inset.shape[1]] = inset
-
-
-def _resize(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a picture by the nearest pixels."""
-    lines = np.arange(height) * picture.shape[0] // height
-    columns = np.arange(width) * picture.shape[1] // width
-    return picture[lines[:, None], columns]
