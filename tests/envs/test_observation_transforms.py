@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 from transforming import ENVIRONMENTS, SAUTE, Priced, still, transformed
 
@@ -97,3 +98,5 @@ def test_costs_and_their_traces_are_observed():
     env.set_seed(0)
     seen = still(env, 6)["next", "observation"][0, :, 4:]
     assert seen.tolist() == [[1, 0.5], [0, 0.25], [4, 2.125], [0, 1.0625], [1, 0.5], [0, 0.25]]
+    everything = TransformedEnv(priced, ObservedCosts(0.5))  # TorchRL's class does not name them
+    assert everything.reset()["observation"].shape == (1, 4 + 2 * len(priced.cost_keys))

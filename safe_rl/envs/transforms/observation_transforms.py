@@ -203,17 +203,21 @@ class ObservedCosts(ConstraintTransform):
         self._costs = self._costs or list(cost_keys)
         check_known(self._costs, cost_keys)
 
+    def _observed(self) -> list[str]:
+        """Names of the observed costs; in TorchRL's `TransformedEnv`, `check` is not called."""
+        return self._costs or list(self.container.cost_keys)
+
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
         """Add the components `last_costs` and `cost_traces`."""
         return add_columns(layout, dict.fromkeys((LAST, TRACE), len(self._costs)))
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return zeros."""
-        shape = (*done.shape[:-1], len(self._costs))
+        shape = (*done.shape[:-1], len(self._observed()))
         return {name: torch.zeros(shape, device=done.device) for name in (LAST, TRACE)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        costs = costs_of(next_tensordict, self._costs).float()
+        costs = costs_of(next_tensordict, self._observed()).float()
         self._rows = {LAST: costs, TRACE: torch.lerp(costs, self._rows[TRACE], self._decay)}
         return self._call(next_tensordict)
 
@@ -223,4 +227,4 @@ class ObservedCosts(ConstraintTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the columns; ValueError for pictures and dictionaries."""
-        return widen(observation_spec, 2 * len(self._costs), "observed_costs")
+        return widen(observation_spec, 2 * len(self._observed()), "observed_costs")
