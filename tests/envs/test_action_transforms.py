@@ -22,6 +22,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 def test_replaced_actions_are_taken_and_counted_and_the_chosen_ones_kept(clamp):
     env = transformed(PointMass(2), f=ActionFilter(lambda step: clamp(step["action"], -0.5, 0.5)))
     assert env.cost_keys == [*PointMass.cost_keys, "cost_interventions"]
+    assert env.highest_cost("cost_interventions") == env.max_episode_steps
     chosen = torch.tensor([[0.2, -0.2], [0.2, 0.9]])
     step = env.step(env.reset().set("action", chosen.clone()))
     assert torch.equal(step["action"], chosen)

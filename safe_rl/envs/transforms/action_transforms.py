@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
-from safe_rl.envs.transforms.base import ConstraintTransform, unbounded_like
+from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.naming import STEPS_TAKEN
 from safe_rl.ranges import PART, Range, Text
 
@@ -105,7 +105,9 @@ class ActionFilter(ConstraintTransform):
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
         """Add the cost."""
-        reward_spec[self.added_costs[0]] = unbounded_like(reward_spec["reward"])
+        like = reward_spec["reward"]
+        cost = Bounded(0.0, 1.0, like.shape, device=like.device, dtype=like.dtype)
+        reward_spec[self.added_costs[0]] = cost
         return reward_spec
 
 
