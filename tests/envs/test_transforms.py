@@ -152,8 +152,9 @@ def test_the_budget_of_simmer_grows_from_episode_to_episode():
 
 def test_the_schedule_continues_where_workers_take_it_up():
     env = transformed(Priced([[0.5] * 4, [0.5] * 4]), "simmer")
+    start = env.reset()
     env.continue_from(8)
-    env.reset()
+    env.reset(start.set("_reset", torch.tensor([[False], [True]])))
     share = transformed(Priced([[0.5] * 4]), "simmer")
     share.set_state(env.get_state().chunk(2)[1])
     assert share.reset()["observation"][0, -1].item() == pytest.approx(0.625)

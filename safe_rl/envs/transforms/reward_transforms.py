@@ -262,7 +262,8 @@ class Simmer(Saute):
     def continue_from(self, steps: int) -> None:
         """Continue the schedule after this number of steps per row."""
         self._steps_before = steps
-        self._rows.pop("age", None)
+        if "age" in self._rows:
+            self._rows["age"] = torch.full_like(self._rows["age"], steps)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return the share of the budget at this step of training, and the step (`age`)."""
