@@ -118,11 +118,11 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     # rows of a stateless environment, of which one goes on
     node = {"_target_": "safe_rl.envs.torchrl.make_torchrl", "id": "PendulumEnv", "num_steps": 8}
     node["outside"] = {"cost_fast": ["thdot", -2, 2]}
-    single, env = make_env(node, num_envs=3, seed=1), make_env(node, num_envs=3, seed=1)
+    single, env = (make_env(node, num_envs=3, seed=1) for _ in range(2))
     env = transformed(env, end=EarlyTermination({"cost": 0.0}), repeat=ActionRepeat(4))
-    once, steps = still(env, 1)["next"][:, 0], still(single, 4)["next"]
-    assert once["steps_taken"][:, 0].tolist() == [2, 4, 3]
-    assert torch.equal(once["observation"][1], steps["observation"][1, -1])
+    held, steps = still(env, 1)["next"], still(single, 4)["next"]
+    assert held["steps_taken"].flatten().tolist() == [2, 4, 3]
+    assert torch.equal(held["observation"][1, -1], steps["observation"][1, -1])
 
 
 def test_evaluation_counts_steps_of_the_environment():

@@ -62,8 +62,7 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
         for column, (factor, d) in enumerate([(1, 4.0), (2, 40.0)]):
             z, after = 1.0, []
             for step in range(7):
-                if step == 5:
-                    z = 1.0
+                z = 1.0 if step == 5 else z
                 assert batch["observation"][row, step, 4 + column].item() == pytest.approx(z)
                 z = (z - factor * costs[row][step % 5] / d) / 0.9
                 after.append(z)
@@ -74,10 +73,8 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
 def test_rows_that_continue_keep_their_budget_when_others_begin():
     env = transformed(Priced([[1.0] * 9, [1.0] * 9]), "saute")
     batch = still(env, 1)
-    state = batch[:, -1]["next"].select("observation").set(
-        "_reset", torch.tensor([[True], [False]])
-    )  # fmt: skip
-    begun = env.reset(state)
+    state = batch[:, -1]["next"].select("observation")
+    begun = env.reset(state.set("_reset", torch.tensor([[True], [False]])))
     assert begun["observation"][:, -1].tolist() == pytest.approx([1.0, (1 - 1 / 2) / 0.9])
 
 
