@@ -4,15 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from safe_rl.naming import did_you_mean as nearest
-
-__all__ = [
-    "ConfigError",
-    "nearest",
-    "on_cpu_only",
-    "require_integer",
-]
-
 
 class ConfigError(ValueError):
     """A configuration cannot be used; the message names the key and what to change."""

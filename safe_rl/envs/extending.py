@@ -12,7 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
 from safe_rl.envs.safety_gym.config_values import (
@@ -44,6 +44,7 @@ from safe_rl.envs.safety_gym.readings import READINGS, Reading
 from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
 from safe_rl.envs.safety_gym.world import World
+from safe_rl.naming import did_you_mean
 from safe_rl.ranges import NotNegative, Positive
 
 __all__ = [
@@ -248,7 +249,7 @@ def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
     if isinstance(kinds, str):
         raise ConfigError(f"'{kinds}' is a text: give the kinds in a tuple, ('{kinds}',).")
     for kind in (kind for kind in kinds if kind not in BY_KIND):
-        hint = nearest(kind, BY_KIND)
+        hint = did_you_mean(kind, BY_KIND)
         raise ConfigError(f"There is no element '{kind}'.{hint} Register the element first.")
 
 

@@ -21,9 +21,10 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from safe_rl.envs.costs import parse_ranges
-from safe_rl.envs.errors import ConfigError, nearest, on_cpu_only
+from safe_rl.envs.errors import ConfigError, on_cpu_only
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
+from safe_rl.naming import did_you_mean
 from safe_rl.ranges import Count, Text, values_of
 
 # These classes use another package by default; MuJoCo's own library is installed.
@@ -65,7 +66,7 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
     """
     for key in node:
         if key not in (*family.keys, "id", "name", "_target_"):
-            meant = nearest(str(key), [*family.keys, "id"])
+            meant = did_you_mean(str(key), [*family.keys, "id"])
             others = " The environment's own arguments belong in 'kwargs': env.kwargs='{…}'."
             raise ConfigError(
                 f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant + others}"
@@ -108,7 +109,7 @@ def _check_torchrl(node: Mapping[str, Any]) -> None:
     if "." not in name and name not in TORCHRL_CLASSES:
         raise ConfigError(
             f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
-            f"{nearest(name, TORCHRL_CLASSES)} For another class of TorchRL use "
+            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class of TorchRL use "
             "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
             "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
         )

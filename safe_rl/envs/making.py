@@ -8,12 +8,13 @@ from typing import Any
 import torch
 
 from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import env_names, env_node, known_names, stored_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
+from safe_rl.naming import did_you_mean
 from safe_rl.targets import locate
 
 
@@ -77,7 +78,7 @@ def _named(name: str) -> str | dict[str, Any]:
         resolve(name)
     except ConfigError:
         raise ConfigError(
-            f"Unknown environment '{name}'.{nearest(name, known_names())} If a module of yours "
-            "stores it by that name (store_config), import the module first."
+            f"Unknown environment '{name}'.{did_you_mean(name, known_names())} If a module of "
+            "yours stores it by that name (store_config), import the module first."
         ) from None
     return name

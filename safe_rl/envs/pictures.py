@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 import mujoco
 import numpy as np
 
-from safe_rl.envs.errors import nearest
 from safe_rl.envs.opengl import open_renderer
+from safe_rl.naming import did_you_mean
 
 FREE = "free"
 
@@ -81,7 +81,7 @@ class Pictures(ABC):
         """
         if isinstance(camera, str) and camera not in self.cameras:
             raise ValueError(
-                f"There is no camera '{camera}'.{nearest(camera, self.cameras)} "
+                f"There is no camera '{camera}'.{did_you_mean(camera, self.cameras)} "
                 f"Choose one of {self.cameras}, or give a mujoco.MjvCamera."
             )
         size = (width, height)

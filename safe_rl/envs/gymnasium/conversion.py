@@ -13,14 +13,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.envs import GymWrapper
 
 from safe_rl.envs.costs import COST, is_cost
-from safe_rl.envs.errors import ConfigError, nearest, require_integer
+from safe_rl.envs.errors import ConfigError, require_integer
 from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
 from safe_rl.envs.gymnasium.env_wrappers import SixValues, make_adapted
 from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
-
-__all__ = ["from_gymnasium", "from_six_values", "make_gymnasium", "make_safety_gymnasium"]
+from safe_rl.naming import did_you_mean
 
 MakeEnv = Callable[[], gymnasium.Env]
 _FAILURES = (AssertionError, NotImplementedError, TypeError, ValueError, gymnasium.error.Error)
@@ -221,7 +220,7 @@ def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEn
     if isinstance(env, gymnasium.Env) or not callable(env):
         raise ConfigError(f"Give an id, or a function that makes an environment; got {env!r}.")
     for key in kwargs:
-        hint = nearest(key, signature(from_gymnasium).parameters)
+        hint = did_you_mean(key, signature(from_gymnasium).parameters)
         raise ConfigError(f"'{key}' is for gymnasium.make, which a function does not use.{hint}")
     return env
 
@@ -246,7 +245,7 @@ def _registered(config: Mapping[str, Any]) -> MakeEnv:
         spec = gymnasium.spec(env_id)
     except gymnasium.error.Error as error:
         raise ConfigError(
-            f"env.id={env_id}: {error} {nearest(env_id, gymnasium.registry)} A module that "
+            f"env.id={env_id}: {error} {did_you_mean(env_id, gymnasium.registry)} A module that "
             "registers an environment is imported by import=my_module."
         ) from error
     return partial(gymnasium.make, spec, **_arguments(config))

@@ -12,11 +12,9 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from safe_rl.envs.errors import nearest
 from safe_rl.envs.pictures import resize
 from safe_rl.envs.torchrl.torchrl_env import TorchRLEnv
-
-__all__ = ["CostReader", "GymnasiumEnv"]
+from safe_rl.naming import did_you_mean
 
 
 class CostReader(BaseInfoDictReader):
@@ -56,8 +54,8 @@ class CostReader(BaseInfoDictReader):
             others = sorted(self._names.difference(self._cost_keys))
             warnings.warn(
                 f"The cost '{key}' is in no info of the first {self._patience} steps, and counts "
-                f"as 0.{nearest(key, others)} The infos have {', '.join(others) or 'no other'}. If "
-                "the cost is reported only when it occurs, it may not have occurred yet.",
+                f"as 0.{did_you_mean(key, others)} The infos have {', '.join(others) or 'no other'}"
+                ". If the cost is reported only when it occurs, it may not have occurred yet.",
                 stacklevel=3,
             )
         self._unseen.clear()

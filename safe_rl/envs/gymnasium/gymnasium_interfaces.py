@@ -22,8 +22,6 @@ from safe_rl.envs.gymnasium.world_arrays import (
     with_masks,
 )
 
-__all__ = ["WorldEnv", "WorldVectorEnv"]
-
 
 class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     """One simulated environment in Gymnasium's interface.

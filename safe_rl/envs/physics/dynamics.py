@@ -12,8 +12,6 @@ import numpy as np
 
 from safe_rl.envs.errors import ConfigError
 
-__all__ = ["SCALES", "scale_dynamics"]
-
 _LINEAR = (
     {int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)},
     {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)},

@@ -12,7 +12,7 @@ import functools
 import mujoco
 
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.bodies import add_bodies, add_floor, add_targets, decorate
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
@@ -22,6 +22,7 @@ from safe_rl.envs.safety_gym.readings import READINGS
 from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot, robot_path
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Scene
+from safe_rl.naming import did_you_mean
 
 # The robot files' stack and contact sizes would reserve hundreds of MB for every environment.
 ARENA_BYTES = 8 << 20
@@ -178,6 +179,6 @@ def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot)
     if wanted not in names:
         raise ConfigError(
             f"'reward_orientation_body': robot '{config.robot_base}' has no body '{wanted}'."
-            f"{nearest(wanted, names)} Its bodies are {', '.join(names)}."
+            f"{did_you_mean(wanted, names)} Its bodies are {', '.join(names)}."
         )
     return 1 + names.index(wanted)

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config_keys import RETIRED, Vocabulary
 from safe_rl.envs.safety_gym.config_values import Key, allowed, coerce
+from safe_rl.naming import did_you_mean
 
 _BUILT_IN: dict[str, Key] = {
     name: vars(Vocabulary)[name]._replace(annotation=annotation)
@@ -51,7 +52,7 @@ class SafetyGymConfig(Vocabulary):
         for name in values:
             if name not in _keys:
                 raise ConfigError(
-                    f"Unknown configuration key '{name}'.{nearest(name, _keys)} "
+                    f"Unknown configuration key '{name}'.{did_you_mean(name, _keys)} "
                     "SafetyGymConfig lists every key with its default."
                 )
         for name, key in _keys.items():
@@ -61,7 +62,7 @@ class SafetyGymConfig(Vocabulary):
         """Return the default of a key that was registered after this configuration was made."""
         if name in _keys:
             return _keys[name].default
-        raise AttributeError(f"There is no configuration key '{name}'.{nearest(name, _keys)}")
+        raise AttributeError(f"There is no configuration key '{name}'.{did_you_mean(name, _keys)}")
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"A configuration cannot be changed: use replace({name}=…).")

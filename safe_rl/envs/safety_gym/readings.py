@@ -12,10 +12,11 @@ import mujoco
 import torch
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_distance
 from safe_rl.envs.safety_gym.world import UNBOUNDED, Block, Bounds, Scene, Shapes, World
+from safe_rl.naming import did_you_mean
 
 
 class Reading(NamedTuple):
@@ -109,7 +110,7 @@ def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
         if name not in known:
             raise ConfigError(
                 f"'sensors_obs': robot '{config.robot_base}' has no sensor '{name}'."
-                f"{nearest(name, known)} It has {', '.join(known) or 'none'}: add the sensor "
+                f"{did_you_mean(name, known)} It has {', '.join(known) or 'none'}: add the sensor "
                 "to the robot's file, or list only those it has."
             )
     return [known[name] for name in config.sensors_obs]

@@ -17,7 +17,8 @@ from typing import Any
 
 import mujoco
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
+from safe_rl.naming import did_you_mean
 
 
 def fingerprint(path: Path) -> str:
@@ -114,7 +115,7 @@ def _check_ranges(model: mujoco.MjModel, path: Path) -> None:
 def _check_body(model: mujoco.MjModel, path: Path) -> None:
     names = [model.body(i).name for i in range(1, model.nbody)]
     if "robot" not in names:
-        hint = nearest("robot", names) or f" Its bodies are {names}."
+        hint = did_you_mean("robot", names) or f" Its bodies are {names}."
         raise _refused(path, f"has no body named 'robot'.{hint} Give the root body this name.")
     body = model.body("robot").id
     if model.body_parentid[body] != 0:

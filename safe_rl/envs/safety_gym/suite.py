@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.config_values import LARGEST_SEED
 from safe_rl.envs.safety_gym.robots import PATHS_OF_2019, ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
+from safe_rl.naming import did_you_mean
 
 Values = dict[str, Any]
 
@@ -148,7 +149,7 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     named = SUITE | EXTRAS
     if name not in named:
         raise ConfigError(
-            f"Unknown environment '{env}'.{nearest(name, named)} The suite has "
+            f"Unknown environment '{env}'.{did_you_mean(name, named)} The suite has "
             "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
             "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and {name}Vision "
             "for each of them."
@@ -163,7 +164,7 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         ConfigError: If keys do not fit together; the message names the first wrong key.
     """
     if config.task not in TASKS:
-        hint = nearest(config.task, TASKS)
+        hint = did_you_mean(config.task, TASKS)
         raise ConfigError(f"'task' must be one of {tuple(TASKS)}, got {config.task!r}.{hint}")
     name = PATHS_OF_2019.get(config.robot_base)
     if name is not None and not Path(config.robot_base).is_file():
@@ -190,5 +191,5 @@ def _check_robot(robot: str) -> None:
     elif robot not in ROBOTS:
         raise ConfigError(
             f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
-            f"got {robot!r}.{nearest(robot, ROBOTS)}"
+            f"got {robot!r}.{did_you_mean(robot, ROBOTS)}"
         )

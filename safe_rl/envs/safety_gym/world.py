@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import mujoco
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.naming import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ class World:
 
     def _slots(self, kind: str) -> slice:
         if kind not in (kinds := self.scene.kinds):
-            hint = f"{nearest(kind, kinds)} There are {', '.join(kinds)}."
+            hint = f"{did_you_mean(kind, kinds)} There are {', '.join(kinds)}."
             raise ConfigError(f"There is no kind '{kind}' of objects.{hint}")
         return self.scene.slots.get(kind, slice(0, 0))
 

@@ -16,10 +16,9 @@ from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.costs import COST, is_cost, parse_ranges
-from safe_rl.envs.errors import ConfigError, nearest
+from safe_rl.envs.errors import ConfigError
+from safe_rl.naming import did_you_mean
 from safe_rl.targets import locate
-
-__all__ = ["Observe", "StepCosts"]
 
 _OBSERVATION = "observation"
 
@@ -147,7 +146,8 @@ def _entry(step: TensorDictBase, name: str) -> Tensor:
     if value is None:
         known = list(map(dotted, after.keys(True, True)))
         raise ConfigError(
-            f"There is no entry '{name}'.{nearest(name, known)} A step writes {', '.join(known)}."
+            f"There is no entry '{name}'.{did_you_mean(name, known)} A step writes "
+            f"{', '.join(known)}."
         )
     return value
 
@@ -232,7 +232,7 @@ def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, Tens
     for name in wanted or ():
         if name not in known:
             raise ConfigError(
-                f"env.observe: there is no entry '{name}'.{nearest(name, known)} There are "
+                f"env.observe: there is no entry '{name}'.{did_you_mean(name, known)} There are "
                 f"{', '.join(known)}."
             )
     below = [name for name in known if name.partition(".")[0] == _OBSERVATION]

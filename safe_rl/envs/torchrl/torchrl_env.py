@@ -34,8 +34,6 @@ from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
 from safe_rl.targets import locate
 
-__all__ = ["TorchRLEnv", "describe_node", "make_torchrl"]
-
 MakeEnv = partial[EnvBase]
 _STEP = "episode_step"  # environments may write TorchRL's default, "step_count", themselves
 # Errors of constructors that get wrong arguments or lack a package.

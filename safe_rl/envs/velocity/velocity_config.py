@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any, get_type_hints
 
-from safe_rl.envs.errors import ConfigError, nearest, on_cpu_only
+from safe_rl.envs.errors import ConfigError, on_cpu_only
 from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.naming import did_you_mean
 from safe_rl.ranges import Count, NotNegative, Number, Positive, Values, values_of
-
-__all__ = ["VELOCITY_SUITE", "Interval", "VelocityConfig", "resolve_velocity"]
 
 
 def _is_interval(value: Any) -> bool:
@@ -112,12 +111,12 @@ class VelocityConfig:
 
 def _check_keys(robot: Any, given: Any) -> None:
     if not isinstance(robot, str) or robot not in RUNNERS:
-        hint = nearest(robot, RUNNERS) if isinstance(robot, str) else ""
+        hint = did_you_mean(robot, RUNNERS) if isinstance(robot, str) else ""
         raise ConfigError(f"'robot' must be one of {list(RUNNERS)}, got {robot!r}.{hint}")
     known = ["robot", *RUNNERS[robot].defaults]
     for key in given:
         if key not in known:
-            hint = on_cpu_only(key) or f"{nearest(str(key), known)} It has {sorted(known)}."
+            hint = on_cpu_only(key) or f"{did_you_mean(str(key), known)} It has {sorted(known)}."
             raise ConfigError(f"Robot '{robot}' has no configuration key '{key}'.{hint}")
 
 
@@ -152,7 +151,7 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
         name = f"Safe{name.removeprefix('Safety')}"
     if name not in VELOCITY_SUITE:
         raise ConfigError(
-            f"Unknown environment '{env}'.{nearest(name, VELOCITY_SUITE)} The velocity family has "
-            f"{', '.join(VELOCITY_SUITE)}."
+            f"Unknown environment '{env}'.{did_you_mean(name, VELOCITY_SUITE)} The velocity family "
+            f"has {', '.join(VELOCITY_SUITE)}."
         )
     return VELOCITY_SUITE[name]
