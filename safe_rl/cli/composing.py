@@ -133,7 +133,7 @@ def _check_form(overrides: Sequence[Override]) -> None:
                 f"{section}='{{{name}: {override.get_value_element_as_str()}}}'."
             )
         values = override.value() if key in _ONE_EACH else ""
-        if values is None:
+        if values is None and not override.is_delete():
             raise CommandLineError(f"'{line}': {key} is a name; no logger is logger=none.")
         if isinstance(values, list):
             raise CommandLineError(
