@@ -134,7 +134,7 @@ def _check_form(overrides: Sequence[Override]) -> None:
             )
         values = override.value() if key in _ONE_EACH else ""
         if values is None and not override.is_delete():
-            raise CommandLineError(f"'{line}': {key} is a name; no logger is logger=none.")
+            raise CommandLineError(f"'{line}': {key} must be a name. For no logger: logger=none.")
         if isinstance(values, list):
             raise CommandLineError(
                 f"'{line}': a run has one {key}; for a run with each of them: "
