@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
@@ -40,6 +41,23 @@ class Progress(Resumable):
         self.epoch += 1
         self.steps += steps
         self.seconds += seconds
+
+
+class RandomGenerators(GlobalRNGState):
+    """The global random generators, without those of accelerators that this machine lacks.
+
+    A run may be continued on another machine, for example one without a GPU.
+    """
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the generators of the CPU, and of as many accelerators as there are."""
+        state = dict(state_dict)
+        for kind in ("cuda", "xpu", "mps"):
+            count = getattr(torch, kind).device_count()
+            saved = state.pop(f"torch_{kind}", None)
+            if saved is not None and count:
+                state[f"torch_{kind}"] = saved if kind == "mps" else saved[:count]
+        super().load_state_dict(state)
 
 
 class WorldSnapshot:

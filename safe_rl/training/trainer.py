@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
-from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
@@ -25,7 +24,7 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
-from safe_rl.training.state import Progress, StopRequest, WorldSnapshot
+from safe_rl.training.state import Progress, RandomGenerators, StopRequest, WorldSnapshot
 
 # Parts that only the newest checkpoints hold, for resuming: a replay buffer has gigabytes, the
 # others are several times as large as a policy.
@@ -125,7 +124,7 @@ class Trainer:
             **self.algorithm.checkpoint_components(),
             "accounting": self.accounting,
             "progress": self.progress,
-            "rng": GlobalRNGState(),
+            "rng": RandomGenerators(),
         }
         if self._worlds is not None:
             parts["env"] = self._worlds

@@ -1,13 +1,14 @@
-"""Signals: what they end, when, and what they leave alone."""
+"""Signals: what they end, when, and what they leave alone; the state of random generators."""
 
 import signal
 import threading
 
 import pytest
+import torch
 from point_mass_runs import point_mass_trainer
 
 from safe_rl.runs.table import read_table
-from safe_rl.training.state import StopRequest
+from safe_rl.training.state import RandomGenerators, StopRequest
 
 
 def signal_in(trainer, epoch):
@@ -79,3 +80,13 @@ def test_signals_are_left_alone_outside_the_main_thread():
     thread.start()
     thread.join()
     assert received == [None]
+
+
+def test_a_machine_without_accelerators_restores_the_generator_of_its_cpu(monkeypatch):
+    for kind in (torch.cuda, torch.xpu, torch.mps):
+        monkeypatch.setattr(kind, "device_count", lambda: 0)
+    state = RandomGenerators().state_dict()
+    drawn = torch.rand(3)
+    other = state["torch_cpu"]
+    RandomGenerators().load_state_dict({**state, "torch_cuda": [other] * 2, "torch_mps": other})
+    assert torch.equal(torch.rand(3), drawn)
