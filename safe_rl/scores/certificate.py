@@ -280,8 +280,8 @@ def first_certified(
         verdicts.append(replace(verdict, tested=tested))
         if verdict.certified is not None:
             return verdicts[-1]
-    # by how much the worst bound of each candidate exceeds its limit
-    excess = [max(verdict.shortfalls.values()) for verdict in verdicts]
+    # by how much the worst bound of each candidate exceeds its limit, in the units of `rank`
+    excess = [max((b - d) / max(d, 1.0) for b, d in one.bounds.values()) for one in verdicts]
     return verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, tested)
 
 
