@@ -1,16 +1,16 @@
-"""How often certificates are wrong, and how often they are given, by both bounds: a simulation.
+"""How often both bounds give certificates, and how often these are wrong, in a simulation.
 
     python benchmarks/certificate_validity.py [repetitions=1000] [episodes=3000] [means=25,22,20,18]
         [costs=FILE.csv] [write=FILE.csv]
 
-For every distribution of episode costs, policies whose true mean is exactly the limit, 25, are
-tested as `safe_rl.scores.certificate.first_certified` tests them, three candidates of a run on the
-same layouts: every certificate is a false one, and at most 5 % may be. Policies whose mean is below
-the limit are tested in the same way: that is the power. Both bounds get the same number of
-episodes; betting may stop earlier. Realistic costs are resampled from `episode_costs.csv`: 1,000
-episodes of the policy `certified/PointGoal1` (`python -m safe_rl.evaluate certified/PointGoal1
-episodes=1000 seed=982451653`, commit df5f814, mean 23.0), scaled to the mean. `costs=` takes them
-from a CSV of your own: a column per policy, a row per episode.
+Policies with known mean costs are tested by `safe_rl.scores.certificate.first_certified`, three
+candidates of a run on the same layouts. If the mean is exactly the limit, 25, every certificate is
+wrong, and at most 5 % of the runs may get one. If the mean is below the limit, the share of runs
+with a certificate is the power of the test. Both bounds get the same number of episodes; betting
+may stop earlier. Realistic costs are resampled from `episode_costs.csv` and scaled to the mean.
+This file has 1,000 episodes of the policy `certified/PointGoal1` (`python -m safe_rl.evaluate
+certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0). `costs=` names
+another CSV file, with a column per policy and a row per episode.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def scaled(draw: Draw, mean: float) -> Draw:
 
 
 def with_catastrophes(draw: Draw, mean: float, one_in: int) -> Draw:
-    """One of so many layouts costs the most that there is; the mean is as given."""
+    """One layout in `one_in` has the highest cost; the mean is as given."""
     usual = scaled(draw, (mean - HIGHEST / one_in) / (1 - 1 / one_in))
     return lambda rng, number: np.where(
         rng.random(number) < 1 / one_in, HIGHEST, usual(rng, number)
@@ -85,8 +85,8 @@ def distributions(mean: float, own: dict[str, Draw]) -> Iterator[tuple[str, Draw
 def is_certified(draw: Draw, bound: str, number: int, rng: np.random.Generator) -> tuple[bool, int]:
     """Whether one of three equal candidates is certified, and on how many episodes in all.
 
-    Their layouts are the same, and with them the catastrophes: a third of what their other episodes
-    cost is common to all of them, too.
+    They have the same layouts, and so the same catastrophes. A third of their other episodes have
+    equal costs too.
     """
     shared = draw(rng, number)
     used: list[int] = []

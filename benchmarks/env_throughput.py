@@ -1,10 +1,11 @@
-"""Environment steps per second, beside the bare physics of the same worlds.
+"""Environment steps per second of Safety Gym, beside the bare physics of the same environments.
 
-The bare loop is what no environment on this backend can beat: the same compiled model with the
-same options, controls and the gremlins' targets in, the substeps, one forward at the end. It starts
-where the environment's episodes start and gets the same controls, so that both compute the same
-trajectories. They are timed in turns in one process; the figures are medians over the turns, and
-one reset of all worlds is spread over the steps of an episode.
+The bare physics is an upper bound for any environment on this backend. It is the same compiled
+model with the same options: controls and the gremlins' targets are written, the substeps are
+taken, and the outputs are computed once. Both start from the same states and get the same
+controls, so that they compute the same trajectories. They are timed in turns in one process.
+Figures are medians over the turns. The time of one reset of all environments is divided among the
+steps of an episode.
 
     python benchmarks/env_throughput.py --envs PointGoal1 DoggoGoal2 --num-envs 64 --threads 0
     python benchmarks/env_throughput.py --envs PointGoal1 --change hazards_num=0 hazards_num=16
@@ -48,7 +49,7 @@ def time_env(env, tensordict, actions):
 
 
 def time_bare(physics, env, actions):
-    """Seconds for the same steps of the physics alone; where the targets go is known before."""
+    """Seconds for the same steps of the physics alone; the targets' paths are not timed."""
     seconds, path = 0.0, None
     for action in actions:
         if env._world.scene.num_targets:
@@ -95,7 +96,7 @@ def measure(name, change, num_envs, threads, steps, repeats):
         env_seconds.append(seconds + steps * reset / config.num_steps)
         bare_seconds.append(time_bare(physics, env, actions))
     if not torch.equal(physics.qpos, env._physics.qpos):
-        raise SystemExit(f"{name}: the two went different ways, there is nothing to compare.")
+        raise SystemExit(f"{name}: the states differ, so the times cannot be compared.")
     env_rate, bare_rate = (
         num_envs * steps / statistics.median(seconds[1:]) for seconds in (env_seconds, bare_seconds)
     )
@@ -110,7 +111,7 @@ def measure_apart(*arguments):
     command = [sys.executable, __file__, "--row", *map(str, arguments)]
     result = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if result.returncode:
-        raise SystemExit(result.returncode)  # it has said why
+        raise SystemExit(result.returncode)  # it has printed the reason
     return json.loads(result.stdout)
 
 
@@ -132,7 +133,7 @@ def main():
         return
     names = list(SUITE) if options.envs == ["all"] else options.envs
     for name, change in itertools.product(names, options.change):
-        build_scene(configuration(name, change))  # what is unknown fails before anything is timed
+        build_scene(configuration(name, change))  # refuses unknown names before anything is timed
     print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
     for case in itertools.product(names, options.change, options.num_envs, options.threads):
         row = measure_apart(*case, options.steps, options.repeats)

@@ -2,7 +2,7 @@
 
     python benchmarks/gpu_throughput.py --device cuda --worlds 1024 4096 8192 32768 --training
 
-It runs on Warp's CPU device too, slowly, to see that it works:
+For a check without a GPU, it also runs on Warp's CPU device, which is slow:
 
     python benchmarks/gpu_throughput.py PointGoal1 --device cpu --worlds 8 --steps 3
 """

@@ -1,16 +1,17 @@
-"""How much of what a policy step gains on its own batch it gains on batches it has not seen.
+"""How much of the gain of a policy step on its own batch is also a gain on other batches.
 
-Batches of one policy, that of a run's last checkpoint; a TRPO step on each, and its surrogate
-gain there and on all others. What is gained on its own batch only is noise of the advantages.
-λ_GAE says how much of it there is, of the cost's advantages most, and the number of conjugate
-gradients how much of it a step follows.
+Batches are collected with the policy of a run's last checkpoint. A TRPO step is taken on each of
+them, and its surrogate gain is computed on this batch and on all others. A gain that occurs only
+on its own batch is noise of the advantages. The size of the noise depends on λ_GAE, most of all
+for the costs. How much of it a step follows depends on the number of conjugate gradient
+iterations.
 
     python benchmarks/held_out_gain.py RUN_DIR --lmbda 0.97,0.97 0.95,0.9 --cg-iterations 3 5 10
 
-Pairs are λ_GAE of rewards and of costs. Gains on other batches are always measured by the
-run's own estimators, so that columns can be compared down a table. A row per pair and number; a
-column per Lagrange multiplier: gain on its own batch / on the others ± standard error, in
-thousandths.
+Pairs are λ_GAE of rewards and of costs. Gains on other batches are always computed with the run's
+own estimators, so that rows can be compared. The table has a row per pair and number of
+iterations, and a column per Lagrange multiplier: gain on its own batch / on the others ± standard
+error, in thousandths.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""Updates per second of SAC on the Lagrangian beside the arithmetic of its networks alone.
+"""Updates per second of SAC-Lagrangian, beside the matrix products of its networks alone.
 
     python benchmarks/off_policy_throughput.py --threads 1 --repeats 10
 
-Both do the same matrix products in turns in one run. The bare ones are plain `torch.nn` perceptrons
-on a fixed minibatch, forward and backward, without TensorDicts, optimiser or buffer; what
-the ratio lacks to 1 is the share of an update that is spent outside of the networks' arithmetic.
-Both multiply matrices as updates of runs do, by oneDNN where it is the faster; ``--plain``: by MKL.
+Both compute the same matrix products, and are timed in turns in one run. The second are the
+forward and backward passes of plain `torch.nn` perceptrons on a fixed minibatch, without
+TensorDicts, optimiser or replay buffer. The difference between the ratio and 1 is the share of an
+update that is not spent on them. Both use oneDNN where it is faster, as runs do; with ``--plain``
+they use MKL.
 """
 
 from __future__ import annotations

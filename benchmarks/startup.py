@@ -1,9 +1,8 @@
-"""Seconds until training takes its first step, and until a short run is over.
+"""Seconds until training takes its first step, and until the end of a short run.
 
-Every figure is from a process of its own, median of several: the imports of torch and TorchRL,
-what `import safe_rl.envs` takes beyond them, `train.py` until the first step, and until the end of
-a run of 20,000 steps, one epoch of the default preset. With compile=true, the compiler's cache is
-empty.
+Every figure is a median over several new processes: of the imports of torch and TorchRL, of the
+further time of `import safe_rl.envs`, of `train.py` until the first step, and of `train.py` with
+20,000 steps, one epoch of the default preset. With compile=true, the compiler's cache is empty.
 
     python benchmarks/startup.py env=PointGoal1 algo=ppo_lagrangian
 """

@@ -1,10 +1,11 @@
-r"""Seconds of training and testing until the first policy that is good and surely safe.
+r"""Seconds until the first policy that reaches a return and is shown to keep its limits.
 
-After an epoch by which the last three on average keep every limit and reach the target return, the
-policy is tested on fresh episodes: it passes if its mean return reaches the target and the upper
-confidence bound of every J_c is within its limit. All tests of a run share one level (Bonferroni),
-so that passing means something however often it was tried. Seconds are those of training and of
-the tests, from the first step; starting Python and compiling come on top.
+A policy is tested after an epoch if the means over the last three epochs keep every limit and
+reach the target return. The test has new episodes. The policy passes if its mean return reaches
+the target and the upper confidence bound of every J_c is within its limit. All tests of a run
+share one level (Bonferroni), so that many tests do not make a wrong result more likely. The
+seconds are those of training and of the tests, from the first step; the start of Python is not
+included.
 
     python benchmarks/time_to_safe.py env=PointGoal1 algo=ppo_lagrangian --seeds 0 1 2 3 4
     python benchmarks/time_to_safe.py env=PointGoal1 algo=trpo transforms=[early_termination] \
@@ -28,7 +29,7 @@ from safe_rl.training.building import build_trainer, seed_everything
 
 
 def is_promising(rows, limits, target):
-    """Whether a test is worth its time after these rows of the table."""
+    """Whether the policy is tested after these rows of the table."""
     mean = feasible_return(rows[-3:], limits)
     return len(rows) >= 3 and mean is not None and mean >= target
 

@@ -1,7 +1,7 @@
 """Steps per second of whole training epochs, split into collecting and updating.
 
-Beside them the environment alone, stepped with random actions by the same number of environments
-and threads; everything in turns in one process, figures are medians over epochs.
+For comparison, the environment alone is stepped with random actions, with the same number of
+environments and threads. All are timed in turns in one process; figures are medians over epochs.
 
     python benchmarks/train_throughput.py env=PointGoal1 algo=ppo_lagrangian
 """

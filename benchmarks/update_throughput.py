@@ -1,11 +1,11 @@
-"""Seconds per policy update and per pass over the critics, on synthetic data.
+"""Seconds per policy update and per pass over policy and critics, on synthetic data.
 
     python benchmarks/update_throughput.py --samples 30000 --threads 2
 
-Networks are tanh perceptrons (256, 256); observations, actions and advantages are random, which
-changes nothing about the work. Matrices are multiplied as in runs, by oneDNN where it is faster.
-The line search of a trust-region step takes as many tries as the data asks for; their number is
-printed. On a busy machine, compare the processor time of one thread.
+Networks are tanh perceptrons (256, 256). Observations, actions and advantages are random, which
+does not change the work of an update, except for the line search of a trust-region step; the
+number of its backtracks is printed. Matrices are multiplied as in runs, by oneDNN where it is
+faster. On a busy machine, compare the processor time of one thread.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Environment steps per second of the velocity family, beside bare physics and Gymnasium.
 
-The bare loop is what no environment on this backend can beat: the same model without sensors, the
-same controls in, the substeps, nothing read. Before every step it is set to the state that the
-environment had then, untimed, so that both compute the same trajectories, resets of the environment
-or not; the script fails if they do not. Gymnasium's `SyncVectorEnv` steps as many of its own
-environments. All take turns in one process; figures are medians over turns of the median step.
+The bare physics is an upper bound for any environment on this backend: the same model without
+sensors gets the same controls and takes the substeps, and nothing is read. Before every step it is
+set to the state of the environment, which is not timed, so that both compute the same steps, also
+after a reset of the environment; the script fails if they differ. Gymnasium's `SyncVectorEnv`
+steps the same number of its own environments. All are timed in turns in one process. Figures are
+medians over turns of the median step.
 
     python benchmarks/velocity_throughput.py --envs SafeHopperVelocity --num-envs 64 256
     python benchmarks/velocity_throughput.py --threads 1 --cpu-time  # on a machine that is shared
@@ -41,7 +42,7 @@ def timed(function):
 
 
 def env_turn(env, tensordict, actions):
-    """Seconds of the environment's steps, the states before and after each, and who goes on."""
+    """Seconds of the environment's steps, the states before and after, and which rows go on."""
     seconds, states = [], [read(env._physics)]
     for action in actions:
         tensordict["action"] = action
@@ -70,7 +71,7 @@ def bare_turn(name, physics, frame_skip, actions, states):
         seconds.append(timed(lambda action=action: step(action))[0])
         qpos, going = after[0], after[-1]
         if not torch.allclose(physics.qpos[going], qpos[going], rtol=1e-9, atol=1e-9):
-            raise SystemExit(f"{name}: the two went different ways, there is nothing to compare.")
+            raise SystemExit(f"{name}: the states differ, so the times cannot be compared.")
     return seconds
 
 
@@ -115,7 +116,7 @@ def main():
     parser.add_argument("--steps", type=int, default=10, help="vector steps per turn")
     parser.add_argument("--repeats", type=int, default=10, help="turns")
     parser.add_argument(
-        "--cpu-time", action="store_true", help="of the process, instead of the wall's; one thread"
+        "--cpu-time", action="store_true", help="instead of wall time; needs --threads 1"
     )
     options = parser.parse_args()
     if options.cpu_time:

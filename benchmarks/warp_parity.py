@@ -1,12 +1,12 @@
-"""MuJoCo Warp beside MuJoCo on the CPU: one step from equal states, random policies.
+"""MuJoCo Warp compared with MuJoCo on the CPU: single steps from equal states, and episodes.
 
     python benchmarks/warp_parity.py PointGoal1 CarButton2 --device cpu
 
-prints the figures of docs/guides/gpu.md. One step: how far positions (m, rad) are apart after a
-step from identical states, and in how many steps by more than 1e-5 and 1e-3; "sensitive": in how
-many of the latter MuJoCo itself ends more than 1e-3 away if the positions before the step are moved
-by 1e-7. Episodes: z of the difference of means of the return, every cost and the goals met by
-random actions.
+The script prints the figures of docs/guides/gpu.md. Steps: the difference of positions (m, rad)
+after one step, and the number of steps in which it is above 1e-5 and above 1e-3. A step of the
+last kind is "sensitive" if the result of MuJoCo itself changes by more than 1e-3 when the
+positions before the step are changed by 1e-7. Episodes: z of the difference of means of the
+return, every cost and the goals met, with random actions.
 """
 
 import argparse
@@ -23,7 +23,7 @@ NUDGE, NUDGES = 1e-7, 8  # m or rad; how many
 
 
 def one_step(config, num_envs, steps, device):
-    """How far positions are apart after one step, and MuJoCo's after nudges, [steps x worlds]."""
+    """Differences after one step, and MuJoCo's own after small changes, [steps x worlds]."""
     warp = SafetyGymEnv(config.replace(physics="warp"), num_envs, device, seed=0)
     cpu = SafetyGymEnv(config, num_envs, seed=0, sleep=False)
     start, on_device = cpu.reset(), warp.reset()

@@ -1,10 +1,11 @@
-"""How many environments, and how many steps a batch: what learns best in the same seconds.
+"""Which number of environments and which batch size learn best in the same time.
 
     python benchmarks/worlds_and_batches.py env=CarGoal1 --seconds 65
 
-measures whole training epochs for every number of environments and every batch, and prints as many
-steps as fit into the seconds, with the command of a run that takes them. The integral gain grows
-with the batch, so that λ moves as fast per step. With `--table` the runs are told of instead:
+The script measures whole training epochs for every number of environments and every batch size. It
+prints the command of a run of each kind, with as many steps as fit into the seconds. The integral
+gain is proportional to the batch, so that λ changes equally fast per step. With `--table`, it
+prints what finished runs have reached:
 
     python benchmarks/worlds_and_batches.py --table results/worlds/equal_seconds.csv.gz
 """
@@ -25,11 +26,11 @@ from safe_rl.training.building import build_trainer, seed_everything
 NUM_ENVS = (20, 50, 100, 200)
 BATCHES = (10_000, 20_000, 40_000)
 GAIN = 0.4 / 20_000  # lagrangian.ki per step of a batch
-LAST = 0.2  # share of a run that the table tells of: the limit stands from 0.7 on
+LAST = 0.2  # share of a run that the table describes; the limit is constant from 0.7 on
 
 
 def cell(num_envs, batch):
-    """What a run of a cell is given on the command line."""
+    """Overrides of a run with these two numbers."""
     return [f"num_envs={num_envs}", f"frames_per_batch={batch}", f"lagrangian.ki={GAIN * batch:g}"]
 
 
