@@ -153,7 +153,7 @@ class Table:
     def write_csv(self, path: Path) -> None:
         """Write the records as CSV; NaN and missing values become empty fields."""
         # a spreadsheet would take a text with such a beginning for a formula
-        risky = lambda value: isinstance(value, str) and value[:1] in {*"=+-@"}  # noqa: E731
+        risky = lambda value: isinstance(value, str) and value[:1] in {*"=+-@\t\r"}  # noqa: E731
         rows = [{k: f"'{v}" if risky(v) else v for k, v in r.items()} for r in self.records]
         frame = import_extra("pandas", "report").DataFrame(rows, dtype=object)
         replace_text(path, frame.to_csv(index=False, lineterminator="\n"))

@@ -52,7 +52,7 @@ def test_a_curve_ends_at_the_final_score(tmp_path):
 
 def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
     records = [
-        {"name": "a&b", "x": 1.25, "x_std": 0.5}, {"name": "=b", "x": float("nan"), "more": 7},
+        {"name": "a&b", "x": 1.25, "x_std": 0.5}, {"name": "=b", "x": float("nan"), "more": "\t7"},
         {"name": "c", "x": 3.0},
     ]  # fmt: skip
     looks = {"a&b": "best", "c": "bad"}
@@ -69,7 +69,7 @@ def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
     assert rows == [
         {"name": "a&b", "x": "1.25", "x_std": "0.5", "more": ""},
         # no formula for a spreadsheet
-        {"name": "'=b", "x": "", "x_std": "", "more": "7"},
+        {"name": "'=b", "x": "", "x_std": "", "more": "'\t7"},
         {"name": "c", "x": "3.0", "x_std": "", "more": ""},
     ]
 
