@@ -7,6 +7,7 @@ are also debug environments, {Point, Car, Doggo} x {Run, Circle}, the same tasks
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,18 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
     if config.constrain_velocity and config.velocity_limit is None:
         raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
+    keys = config.to_dict()
+    for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
+        pinned, number = len(keys.get(f"{kind}_locations", ())), keys.get(f"{kind}_num", 1)
+        if pinned > number:
+            raise ConfigError(
+                f"'{kind}_locations' has {pinned} locations for {number} objects: change either."
+            )
+        if keys.get(f"constrain_{kind}") and not number:
+            warnings.warn(
+                f"'constrain_{kind}' has no effect: its costs are 0, because '{kind}_num' is 0.",
+                stacklevel=2,
+            )
     return config
 
 
