@@ -16,8 +16,7 @@ class Walk(gymnasium.Env):
         self.render_mode = render_mode
         if nested:
             self.observation_space = gymnasium.spaces.Dict(
-                place=gymnasium.spaces.Box(-np.inf, np.inf, (2,)),
-                side=gymnasium.spaces.Discrete(2),
+                place=gymnasium.spaces.Box(-np.inf, np.inf, (2,)), side=gymnasium.spaces.Discrete(2)
             )
 
     def reset(self, *, seed=None, options=None):

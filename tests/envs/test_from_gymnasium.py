@@ -162,6 +162,7 @@ def test_a_copy_continues_as_the_original_does(copied):
         (Counter, {"num_steps": None}, "give 'num_steps'"),
         (Counter(), {}, "an id, or a function that makes an environment; got <.*Counter"),
         (lambda: 3, {}, "must return a gymnasium.Env.*returned 3"),
+        (lambda: 3, {"cost_keys": ["cost"]}, "must return a gymnasium.Env.*returned 3"),
         (Counter, {"num_env": 2}, "'num_env' is for gymnasium.make.*Did you mean 'num_envs'"),
         (Counter, {"cost_keys": "cost"}, r"'cost_keys' must be a list.*\['cost'\]"),
         (Counter, {"num_envs": 0}, "'num_envs' must be an integer of at least 1"),

@@ -191,9 +191,9 @@ def _describe(
         require_integer("num_steps", num_steps, lowest=1)
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
+    if cost_keys is not None and num_steps is not None:  # environments may be slow to make
+        return [*dict.fromkeys(cost_keys)], num_steps
     probe = make()
-    if not isinstance(probe, gymnasium.Env):
-        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {probe!r}.")
     try:
         keys = _find_costs(probe) if cost_keys is None else [*dict.fromkeys(cost_keys)]
         if cost_keys is None and not keys and not outside:
@@ -201,7 +201,8 @@ def _describe(
                 f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "
                 "info. If a cost has another name, or is not reported at every step, name it in "
                 "'cost_keys'. To give a cost to every step that leaves a range, use 'outside': "
-                "env.outside='{cost_position: [0, -0.5, 0.5]}'."
+                "env.outside='{cost_position: [0, -0.5, 0.5]}'. An algorithm without constraints "
+                "needs no costs: with env.cost_keys=[cost] algo=ppo, a missing cost counts as 0."
             )
         known = None if probe.spec is None else probe.spec.max_episode_steps
         length = known if num_steps is None else num_steps
@@ -222,7 +223,14 @@ def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEn
     for key in kwargs:
         hint = did_you_mean(key, signature(from_gymnasium).parameters)
         raise ConfigError(f"'{key}' is for gymnasium.make, which a function does not use.{hint}")
-    return env
+    return partial(_checked, env)
+
+
+def _checked(make: MakeEnv) -> gymnasium.Env:
+    made = make()
+    if not isinstance(made, gymnasium.Env):
+        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {made!r}.")
+    return made
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:

@@ -60,17 +60,15 @@ class FloatCosts(gymnasium.Wrapper):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, and convert the costs."""
         *values, info = self.env.step(action)
-        reported = [key for key in self._cost_keys if key in info]
-        return *values, {**info, **{key: _number(key, info[key]) for key in reported}}
-
-
-def _number(key: str, value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        raise ConfigError(
-            f"info['{key}'] must be one number per step, because it is a cost; got {value!r}."
-        ) from None
+        costs = {key: info[key] for key in self._cost_keys if key in info}
+        for key, cost in costs.items():
+            try:
+                costs[key] = float(cost)
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"info['{key}'] must be one number per step, as it is a cost; got {cost!r}."
+                ) from None
+        return *values, {**info, **costs}
 
 
 class SixValues(gymnasium.Wrapper):
