@@ -3,7 +3,7 @@
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, PendulumEnv
 
 
 class Runner(EnvBase):
@@ -53,6 +53,14 @@ class Charged(Runner):
 
     def _reset(self, tensordict=None, **_):
         return super()._reset(tensordict).exclude("cost_effort")
+
+
+class Alone(PendulumEnv):
+    """A pendulum that cannot be reset with others."""
+
+    def _reset(self, tensordict, **keys):
+        assert tensordict is None or not tensordict.batch_size, "one at a time"
+        return super()._reset(tensordict, **keys)
 
 
 def upright(step, limit=1.0):

@@ -81,6 +81,12 @@ def test_a_step_is_that_of_the_environment():
     assert start["th"].unique().numel() == 3  # rows begin on their own
 
 
+def test_why_rows_cannot_be_stepped_at_once_is_said(trusted):
+    with pytest.warns(UserWarning, match=r"Alone cannot step several rows.* one at a time"):
+        env = make_env(PENDULUM | {"id": "torchrl_envs.Alone"}, num_envs=3, seed=0)
+    assert env.rollout(2).shape == (3, 2)
+
+
 def test_rows_end_and_begin_apart():
     env = make_env(PENDULUM | {"num_steps": 8}, num_envs=3, seed=0)
     state = env.reset()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from operator import methodcaller
@@ -160,8 +161,13 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
         try:
             rows.reset()
             return rows
-        except Exception:  # custom code may not work with several rows, and raise any error
-            pass
+        except Exception as error:  # custom code may raise any error
+            if not make.func.__module__.startswith("torchrl."):
+                warnings.warn(
+                    f"{make.func.__name__} cannot step several rows at once, so its environments "
+                    f"are stepped one after the other. {type(error).__name__}: {error}",
+                    stacklevel=2,
+                )
     if list(env.batch_size) == [num_envs]:
         return env
     env.close(raise_if_closed=False)
