@@ -114,16 +114,17 @@ class ExploringPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self._samples = isinstance(actor, ProbabilisticTensorDictSequential)
-        self.network = (actor.module[0] if self._samples else actor).module
-        self.noise = noise
-        self.in_keys, self.out_keys = ["observation"], ["action"]
+        network, sampler = (actor.module[0], actor.module[-1]) if self._samples else (actor, actor)
+        self.network, self.noise = network.module, noise
+        # of a sampler, the log-probability comes second
+        self.in_keys, self.out_keys = list(network.in_keys), list(sampler.out_keys[:1])
         device = next(actor.parameters()).device
         for name, value in (("low", low), ("high", high), ("is_random", torch.tensor(False))):
             self.register_buffer(name, value.to(device), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        outputs = self.network(tensordict.get("observation"))
+        outputs = self.network(tensordict.get(self.in_keys[0]))
         is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
         if self._samples:
@@ -138,4 +139,4 @@ class ExploringPolicy(TensorDictModuleBase):
         if is_noisy:
             uniform = self.low + 2 * half * torch.rand_like(action)
             action = torch.where(self.is_random, uniform, action)
-        return tensordict.set("action", action)
+        return tensordict.set(self.out_keys[0], action)

@@ -79,6 +79,7 @@ class QEnsemble(TensorDictModuleBase):
         num_outputs: Values per network: 1 for the reward, K for K costs.
         input_scale: Fixed factors of the observation, or None.
         device: Device of the parameters.
+        in_keys: Keys of observation and action.
         out_key: Key of the values.
 
     Examples:
@@ -98,10 +99,11 @@ class QEnsemble(TensorDictModuleBase):
         num_outputs: int = 1,
         input_scale: Tensor | None = None,
         device: torch.device | None = None,
+        in_keys: Sequence[NestedKey] = ("observation", "action"),
         out_key: NestedKey = "state_action_value",
     ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = ["observation", "action"], [out_key]
+        self.in_keys, self.out_keys = list(in_keys), [out_key]
         self.num_networks = num_networks
         self.scale = nn.Identity() if input_scale is None else InputScale(input_scale.to(device))
         sizes = [observation_size + action_size, *hidden_sizes, num_outputs]

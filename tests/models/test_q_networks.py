@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, TanhNormal
@@ -47,11 +48,12 @@ def test_its_weights_begin_like_those_of_torch():
 
 def test_q_functions_see_scaled_observations_and_the_action():
     scale = torch.tensor([1.0, 0.1, 1.0, 1.0, 1.0])
-    q = QEnsemble(5, 2, hidden_sizes=[8], num_networks=2, num_outputs=3, input_scale=scale)
-    steps = observations(4).set("action", torch.rand(4, 2))
+    sizes = {"hidden_sizes": [8], "num_networks": 2, "num_outputs": 3}
+    q = QEnsemble(5, 2, **sizes, input_scale=scale, in_keys=[("agents", "observation"), "action"])
+    steps = TensorDict(agents=observations(4), action=torch.rand(4, 2), batch_size=[4])
     values = q(steps)
     assert values.batch_size == (2, 4)
-    expected = q.network(torch.cat([steps["observation"] * scale, steps["action"]], -1))
+    expected = q.network(torch.cat([steps["agents", "observation"] * scale, steps["action"]], -1))
     assert torch.equal(values["state_action_value"], expected)
     assert "state_action_value" not in steps.keys()  # noqa: SIM118
 
@@ -80,15 +82,16 @@ def test_it_samples_the_distribution_of_a_squashed_actor():
 
 
 def test_it_adds_noise_to_a_deterministic_actor_within_bounds():
-    actor = make_bounded_actor(5, LOW, HIGH, hidden_sizes=[8])
-    batch = observations(1).expand(20_000).clone()
+    network, key = make_bounded_actor(5, LOW, HIGH, hidden_sizes=[8]).module, ("agents", "action")
+    actor = TensorDictModule(network, [("agents", "observation")], [key])
+    batch = TensorDict(agents=observations(1), batch_size=[1]).expand(20_000).clone()
     with torch.no_grad():
-        own = actor(batch.clone())["action"][0]
-        found = ExploringPolicy(actor, LOW, HIGH, noise=0.1)(batch)["action"]
+        own = actor(batch.clone())[key][0]
+        found = ExploringPolicy(actor, LOW, HIGH, noise=0.1)(batch)[key]
     torch.testing.assert_close(found.std(0), torch.tensor([0.1, 0.4]), rtol=0.05, atol=0)
     torch.testing.assert_close(found.mean(0), own, rtol=0, atol=0.02)
     with torch.no_grad():
-        wild = ExploringPolicy(actor, LOW, HIGH, noise=10.0)(batch)["action"]
+        wild = ExploringPolicy(actor, LOW, HIGH, noise=10.0)(batch)[key]
     assert ((wild >= LOW) & (wild <= HIGH)).all()
 
 
