@@ -111,6 +111,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             constraints=constraints,
             cost_limits=limits,
         )
+        update = build_update(config.policy_update, ReplayUpdate, loss=loss)
         _check_loss(config, constraints, loss)
         buffer: Memory = build_part(
             config.memory,
@@ -127,7 +128,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             networks=networks,
             constraints=constraints,
             replay_buffer=buffer,
-            policy_update=build_update(config.policy_update, ReplayUpdate, loss=loss),
+            policy_update=update,
             random_steps=random_steps,
             steps_per_decision=env.steps_per_decision,
             collects=collects,

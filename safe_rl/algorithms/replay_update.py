@@ -36,6 +36,7 @@ class ReplayUpdate(Checked):
         compile: Whether to compile the losses with torch.compile.
 
     Raises:
+        TypeError: If the loss is no `ReplayLoss`.
         ValueError: If an argument is outside its range, no parameter's name begins with a key of
             ``rates``, or the loss has target networks and ``tau`` is None.
         FloatingPointError: By the call, if a loss is not finite, before the step on this loss.
@@ -65,6 +66,11 @@ class ReplayUpdate(Checked):
         max_grad_norm: Positive | None = None,
         compile: bool = False,
     ) -> None:
+        if not isinstance(loss, ReplayLoss):
+            raise TypeError(
+                f"{type(loss).__module__}.{type(loss).__name__} is no loss on a replay buffer: use "
+                "one of safe_rl.objectives, or derive it from its q_functions.ReplayLoss."
+            )
         self.loss, self.policy_delay = loss, policy_delay
         self.updates_per_step, self.max_grad_norm = updates_per_step, max_grad_norm
         self.optimizer = optimizer(_groups(loss, rates or {}))

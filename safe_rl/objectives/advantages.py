@@ -152,10 +152,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         return self._estimate(tensordict, None, next_value)[-1]
 
     def _estimate(
-        self,
-        tensordict: TensorDictBase,
-        params: TensorDictBase | None,
-        next_value: Tensor | None,
+        self, tensordict: TensorDictBase, params: TensorDictBase | None, next_value: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Value, advantage and value target, [..., T, F] each."""
         keys = self.tensor_keys
@@ -246,4 +243,6 @@ class CostGAE(VectorGAE):
         **settings: Any,
     ) -> None:
         super().__init__(value_network, **settings)
+        if not cost_keys:
+            raise ValueError("cost_keys must name at least one cost.")
         self.set_keys(reward=list(cost_keys))

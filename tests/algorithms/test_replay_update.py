@@ -88,9 +88,11 @@ def test_a_checkpoint_of_before_the_first_update_is_whole(memory):
     assert trained.loss.alpha_init.equal(make_update(0).loss.alpha_init)
 
 
-def test_targets_that_would_never_move_are_refused():
+def test_targets_that_would_never_move_and_other_losses_are_refused():
     with pytest.raises(ValueError, match="tau is null, but SACLoss has target networks"):
         make_update(0, tau=None)
+    with pytest.raises(TypeError, match=r"Linear is no loss on a replay buffer.*ReplayLoss"):
+        ReplayUpdate(torch.nn.Linear(1, 1), optimizer=torch.optim.Adam, updates_per_step=1, tau=0.1)
 
 
 def test_rates_are_those_of_the_longest_beginning_and_wrong_ones_are_told_the_nearest():
