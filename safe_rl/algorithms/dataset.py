@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
@@ -13,6 +14,7 @@ from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
+from safe_rl.files import read_config
 
 
 def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tuple[str, bool]:
@@ -45,7 +47,18 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
         )
         return warning if config.frames < random_steps else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    return _fill(buffer, node, limits, env, bounded_actions(env)), not node.alone
+    learns_from = _fill(buffer, node, limits, env, bounded_actions(env))
+    return learns_from + _other_environment(config), not node.alone
+
+
+def _other_environment(config: DictConfig) -> str:
+    """A warning if a recording is in the folder of a run of another environment; else empty."""
+    try:
+        name = read_config(Path(config.dataset.path).parent / "config.yaml")["env"]["name"]
+    except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
+        return ""
+    own = config.env.name
+    return "" if name == own else f" Warning: they are of {name}, and this environment is {own}."
 
 
 def _fill(

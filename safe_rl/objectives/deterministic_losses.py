@@ -163,7 +163,7 @@ class BCLoss(ReplayLoss):
     of Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024).
 
     Args:
-        actor_network: Deterministic policy.
+        actor_network: Deterministic policy, which writes the action alone.
         loss_function: Distance between the policy's actions and the recorded ones.
 
     Examples:
@@ -186,6 +186,11 @@ class BCLoss(ReplayLoss):
         self, actor_network: TensorDictModuleBase, *, loss_function: Distance = "l2"
     ) -> None:
         super().__init__()
+        if len(actor_network.out_keys) != 1:
+            raise ValueError(
+                "actor_network must be deterministic, and write the action alone, not "
+                f"{actor_network.out_keys}."
+            )
         self.convert_to_functional(actor_network, "actor_network")
         self.loss_function = loss_function
         self.in_keys = [*actor_network.in_keys, *actor_network.out_keys]

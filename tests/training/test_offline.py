@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from safe_rl.algorithms import OffPolicy
 from safe_rl.collectors import Recording, make_collector, read_recording, safe_episodes
 from safe_rl.evaluation.episodes import collect_episodes
-from safe_rl.models import make_bounded_actor
+from safe_rl.models import make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import BCLoss
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
@@ -66,10 +66,11 @@ def make_trainer(config, directory):
 
 def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     data = record(tmp_path / "data", head_north, head_south)
+    (tmp_path / "config.yaml").write_text("env: {name: CarGoal1}")
     trainer = make_trainer(offline_config(data), tmp_path / "run")
     assert trainer.algorithm.learns_from == (
         f"Learning from 160 of 320 transitions in {data}: those of whole episodes that keep the "
-        "limits."
+        "limits. Warning: they are of CarGoal1, and this environment is PointMass."
     )
     trainer.run()
     found = collect_episodes(
@@ -203,6 +204,8 @@ def test_the_loss_is_the_mean_squared_difference():
     assert all(p.grad is not None for p in actor.parameters())
     with pytest.raises(KeyError, match="action"):
         BCLoss(actor)(steps.exclude("action"))
+    with pytest.raises(ValueError, match=r"deterministic.*, not \['loc', 'scale'"):
+        BCLoss(make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
 
 
 def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path):
