@@ -227,9 +227,11 @@ def evaluate_variations(
     checkpoint = find_checkpoint(directory, options.checkpoint)
     file, picture = (RunFolder(directory).variations(options.name, kind) for kind in ("csv", "png"))
     check_places([file, picture])
-    for variation in variations:  # a wrong key is found before the first episode
+    for variation in variations:  # wrong keys and layouts are found before the first episode
         if not variation.may_lack and (changed := varied(config, variation)) is not None:
-            Trial(changed, checkpoint, options, make_env).make(num_envs=1).close()
+            env = Trial(changed, checkpoint, options, make_env).make(num_envs=1)
+            env.reset()
+            env.close()
     rows: list[VariedRow] = []
     left_out: list[tuple[Variation, str]] = []
     facts: dict[str, Any] = {}

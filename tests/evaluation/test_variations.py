@@ -39,10 +39,6 @@ def rows_of(folder, name="variations"):
         return {row["variation"]: row for row in csv.DictReader(file)}
 
 
-def numbers(row):
-    return {k: float(v) for k, v in row.items() if k.startswith(("episode_", "over_", "cvar_"))}
-
-
 def test_every_row_is_the_evaluation_of_its_environment(run, capsys):
     rows = "{mass: {env.mass_scale: [0.5, 2]}, dense: {env.hazards_num: x1.5}}"
     assert main([str(run), f"variations={rows}", *QUICK]) == 0
@@ -64,6 +60,9 @@ def test_every_row_is_the_evaluation_of_its_environment(run, capsys):
         assert f"{row['variation']} " in shown
     with Image.open(run / "variations.png") as picture:
         assert picture.width > 400
+    assert main([str(run), "variations={full: {env.hazards_num: 60}}", *QUICK]) == 1
+    out, err = capsys.readouterr()
+    assert ("'hazards_num' is 60" in err, "as trained" in out) == (True, False)
 
 
 def test_variations_may_have_other_costs(run, capsys):
