@@ -125,11 +125,13 @@ def wrong_task(reward, **others):
 
 
 GOAL = {"elements": ("goal",), "met": lambda c, w, now: w.robot_pos[:, :1] > 0}
+FLAT = replace(cube("cones", "cone", Motion.FREE), geoms=lambda c: (Geom(BOX, (0.1, 0.1)),))
 ONE_GEOM = replace(cube("cones", "cone", Motion.FREE), geoms=lambda c: Geom(BOX, (0.1,) * 3))
 WRONG = {
     "two per world": (lambda: wrong_cost(lambda c, w: w.robot_xy), r"cost_odd .*\[2\].* \[2, 2\]"),
     "no number": (lambda: wrong_cost(lambda c, w: w.up * math.nan), "cost_odd .* got nan: give"),
     "infinite": (lambda: wrong_cost(lambda c, w: w.up / 0), "cost_odd .* finite, got inf: give"),
+    "size": (lambda: register_element(FLAT, {"cones_num": 1}), "(?s)size 2 must be.*your elements"),
     "geoms": (lambda: register_element(ONE_GEOM, {"cones_num": 1}), "^'geoms' of 'cones' must ret"),
     "key": (lambda: wrong_cost(lambda c, w: c.goal_sise * w.up), "'goal_sise'.*'goal_size'"),
     "reward": (lambda: wrong_task(lambda c, w, b, n: 1.0), r"'reward' .*\[2\].* a float"),

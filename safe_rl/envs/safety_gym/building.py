@@ -71,7 +71,8 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
     except ValueError as error:
         raise ConfigError(
             f"MuJoCo cannot build the world of 'robot_base' {config.robot_base}: {error}. If a "
-            "name is repeated, rename the robot's part: it has the name of an object in the world."
+            "name is repeated, rename the robot's part: it has the name of an object in the world. "
+            "If a size is wrong, correct the Geoms of your elements."
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
     scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
