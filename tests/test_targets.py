@@ -106,8 +106,7 @@ def test_what_the_package_keeps_to_itself_is_reached_where_the_user_names_its_mo
     monkeypatch.setitem(targets._ROOMS, "safe_rl.collectors.recording", None)
     assert locate("safe_rl.collectors.recording.Recording").__name__ == "Recording"
     with pytest.raises(
-        TargetError,
-        match=r"only make_gymnasium, .*\. Did you mean 'make_gymnasium'",
+        TargetError, match=r"only make_gymnasium, .*\. Did you mean 'make_gymnasium'"
     ):
         locate("safe_rl.envs.gymnasium.make_gym")
 

@@ -267,11 +267,7 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
 
     @torch.no_grad()
     def update_priority(
-        self,
-        index: int | Tensor,
-        priority: float | Tensor,
-        *,
-        storage: Storage | None = None,
+        self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None
     ) -> None:
         """Set the priorities of transitions from their TD errors."""
         errors = torch.as_tensor(priority).to(self._priorities).abs()

@@ -250,11 +250,7 @@ class TRPOStep(PolicyUpdate):
 
         max_tries = self.max_backtracks if proposal.step.any() else 0
         fraction = backtracking_search(
-            self.parameters,
-            proposal.step,
-            accept,
-            coeff=self.backtrack_coeff,
-            max_tries=max_tries,
+            self.parameters, proposal.step, accept, coeff=self.backtrack_coeff, max_tries=max_tries
         )
         if not fraction:
             tried = {"kl": proposal.step.new_zeros(()), "losses": self.loss(batch)}

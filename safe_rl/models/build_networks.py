@@ -82,11 +82,7 @@ def build_networks(
 
 
 def _actor(
-    observed: Observed,
-    head: Head,
-    widths: Sequence[int],
-    recurrent_size: int,
-    device: torch.device,
+    observed: Observed, head: Head, widths: Sequence[int], recurrent_size: int, device: torch.device
 ) -> ProbabilisticTensorDictSequential:
     """Hidden layers and a head; a recurrent layer between them if ``recurrent_size`` is not 0."""
     if not recurrent_size:

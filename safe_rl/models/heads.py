@@ -127,10 +127,6 @@ def gaussian_head(
     return Head(action_size, scale, ("loc", "scale"), IndependentNormal)
 
 
-def _gaussian(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
-    return gaussian_head(spec.shape[-1], initial_log_std, device)
-
-
 def _tanh(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
     """A Gaussian squashed into the bounds; its scale is that before squashing."""
     low, high = _bounds(spec, device)
@@ -219,10 +215,6 @@ def choices(logits: Tensor) -> distributions.Independent:
     return distributions.Independent(distributions.Categorical(logits=logits), 1)
 
 
-def _one_hot(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
-    return Head(spec.shape[-1], nn.Identity(), ("logits",), OneHotCategorical)
-
-
 class _Concentrations(nn.Module):
     """Two concentrations above 1 per component: densities are unimodal (Chou et al. 2017)."""
 
@@ -278,9 +270,14 @@ def _is_one_hot(spec: TensorSpec) -> bool:
 
 
 HEADS: Mapping[str, _Row] = {
-    "gaussian": _Row(_is_continuous, _gaussian),
+    "gaussian": _Row(
+        _is_continuous, lambda spec, log_std, device: gaussian_head(spec.shape[-1], log_std, device)
+    ),
     "tanh": _Row(_is_continuous, _tanh),
     "beta": _Row(_is_continuous, _beta),
     "categorical": _Row(_is_choice, _categorical),
-    "one_hot": _Row(_is_one_hot, _one_hot),
+    "one_hot": _Row(
+        _is_one_hot,
+        lambda spec, *_: Head(spec.shape[-1], nn.Identity(), ("logits",), OneHotCategorical),
+    ),
 }

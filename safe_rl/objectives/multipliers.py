@@ -167,11 +167,7 @@ class LagrangeMultiplier(Multiplier):
     exp_avg_sq: Tensor
 
     def __init__(
-        self,
-        cost_limits: CostLimits,
-        *,
-        init: AboveZero | Sequence[AboveZero],
-        lr: Positive,
+        self, cost_limits: CostLimits, *, init: AboveZero | Sequence[AboveZero], lr: Positive
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)

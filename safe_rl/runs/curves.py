@@ -113,11 +113,7 @@ def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
 
 
 def _draw(
-    axes: Axes,
-    steps: np.ndarray,
-    values: Sequence[float] | np.ndarray,
-    colour: str,
-    label: str,
+    axes: Axes, steps: np.ndarray, values: Sequence[float] | np.ndarray, colour: str, label: str
 ) -> None:
     """Draw the values of epochs in which an episode finished, and their moving mean."""
     known = np.isfinite(values)

@@ -15,11 +15,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.processor_use import fast_products, torch_threads
-from safe_rl.collectors import (
-    EpisodeAccounting,
-    Recording,
-    WorkerCollector,
-)
+from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord

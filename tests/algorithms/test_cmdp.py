@@ -156,10 +156,7 @@ def crpo(actor, cmdp):
 
 def pcpo(actor, cmdp):
     step = PCPOStep(
-        CPOLoss(actor, entropy_coeff=0.0),
-        projection="kl",
-        rescale_violation=True,
-        **TRUST_REGION,
+        CPOLoss(actor, entropy_coeff=0.0), projection="kl", rescale_violation=True, **TRUST_REGION
     )
     return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
 

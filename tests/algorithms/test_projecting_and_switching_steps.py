@@ -94,17 +94,13 @@ def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violat
         assert change < 0
 
 
-def crpo(actor, tolerance=2.0):
-    return CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=tolerance, **SETTINGS)
-
-
 @pytest.mark.parametrize(
     ("violation", "reduces"),
     [([1.9, -5.0], None), ([2.1, -5.0], 0), ([3.0, 9.0], 1), ([torch.nan, torch.nan], None)],
 )
 def test_crpo_switches_at_the_limit_and_its_tolerance(violation, reduces):
     actor, batch = make_case()
-    step = crpo(actor)
+    step = CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=2.0, **SETTINGS)
     before = step.loss(batch)
     metrics = step(batch, torch.tensor(violation), LENGTH)
     after = step.loss(batch)

@@ -17,12 +17,7 @@ from samples import (
 from tensordict import TensorDict
 
 from safe_rl.algorithms import CPOStep, TRPOStep
-from safe_rl.objectives import (
-    CPOLoss,
-    LagrangeMultiplier,
-    TRPOLagrangianLoss,
-    TRPOLoss,
-)
+from safe_rl.objectives import CPOLoss, LagrangeMultiplier, TRPOLagrangianLoss, TRPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.gae import normalise_advantages

@@ -19,12 +19,7 @@ MISSING_OPENGL = _missing_opengl()
 needs_opengl = pytest.mark.skipif(bool(MISSING_OPENGL), reason=MISSING_OPENGL)
 
 # A robot at the origin that looks along x, and nothing else.
-ALONE = {
-    "robot_base": "point",
-    "robot_locations": [(0.0, 0.0)],
-    "robot_rot": 0.0,
-    "task": "none",
-}
+ALONE = {"robot_base": "point", "robot_locations": [(0.0, 0.0)], "robot_rot": 0.0, "task": "none"}
 
 
 def make_env(config, num_envs=1, **changes):

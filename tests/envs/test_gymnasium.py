@@ -10,14 +10,7 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
 
-from safe_rl.envs import (
-    EXTRAS,
-    SUITE,
-    ConfigError,
-    SafetyGymEnv,
-    env_node,
-    make_env,
-)
+from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymEnv, env_node, make_env
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
 IDS = [f"Safexp-{name}-v0" for name in (*SUITE, *EXTRAS)]

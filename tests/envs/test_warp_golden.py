@@ -20,10 +20,6 @@ SWITCHES = {"car_push": 0.35}
 RATES = ("gyro", "velocimeter", "jointvel_", "ballangvel", "qvel", "touch_")
 
 
-def tolerance(name):
-    return 2e-2 if name.startswith(RATES) else 1e-3
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -54,4 +50,5 @@ def test_a_step_from_every_recorded_state(name):
         kept = near & ~met if part.startswith("goal_") else near
         return kept & (part != "accelerometer")
 
+    tolerance = lambda name: 2e-2 if name.startswith(RATES) else 1e-3  # noqa: E731
     assert_components(golden, following["observation"].numpy(), keep, tolerance, rtol=1e-3)

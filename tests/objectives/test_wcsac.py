@@ -47,10 +47,6 @@ def test_the_tail_is_the_mean_beyond_the_quantile(tail):
     assert gaussian_tail(tail) == pytest.approx(mean, rel=1e-6)
 
 
-def inverse_softplus(value):
-    return value + np.log(-np.expm1(-value))
-
-
 @pytest.mark.parametrize("end", ["gaussian", "terminated"])
 def test_a_chain_is_learned_to_the_mean_and_variance_of_its_gaussian_return(end):
     """Four steps of known costs; then the end, or a return that is normal with 3 and 0.8²."""
@@ -63,7 +59,7 @@ def test_a_chain_is_learned_to_the_mean_and_variance_of_its_gaussian_return(end)
         (params["network", "weights", "0"], params["network", "biases", "0"].data.zero_())
         for params in (loss.cost_qvalue_network_params, loss.target_cost_qvalue_network_params)
     )
-    layer.data[:, 4] = torch.tensor([[3.0], [inverse_softplus(0.64)]])
+    layer.data[:, 4] = torch.tensor([[3.0], [0.64 + np.log(-np.expm1(-0.64))]])  # softplus 0.64
     optimizer = torch.optim.Adam([layer], lr=0.05)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.999)
     for _ in range(4000):

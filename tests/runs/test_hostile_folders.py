@@ -30,8 +30,7 @@ def test_a_link_in_the_place_of_an_unfinished_file_is_not_followed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "place",
-    ["transitions", "checkpoints", "checkpoints/last", "checkpoints/best", "code.json"],
+    "place", ["transitions", "checkpoints", "checkpoints/last", "checkpoints/best", "code.json"]
 )
 def test_a_folder_with_links_is_not_written_to(place, tmp_path):
     mine, run = tmp_path / "mine", tmp_path / "run"

@@ -48,10 +48,6 @@ class NextGoal(Enum):
     BUTTON = "button"
 
 
-def _no_measure(world: World) -> Tensor:
-    return world.robot_pos.new_zeros(len(world.robot_pos), 0)
-
-
 class Task(NamedTuple):
     """A row: one task.
 
@@ -66,7 +62,7 @@ class Task(NamedTuple):
     """
 
     reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
-    measure: Callable[[World], Tensor] = _no_measure
+    measure: Callable[[World], Tensor] = lambda w: w.robot_pos.new_zeros(len(w.robot_pos), 0)
     met: Callable[[SafetyGymConfig, World, Tensor], Tensor] | None = None
     next_goal: NextGoal | None = None
     elements: tuple[str, ...] = ()
@@ -142,12 +138,7 @@ def goal_is_button(task: str) -> bool:
 
 
 def dense_reward(
-    task: Task,
-    config: SafetyGymConfig,
-    world: World,
-    before: Tensor,
-    now: Tensor,
-    failed: Tensor,
+    task: Task, config: SafetyGymConfig, world: World, before: Tensor, now: Tensor, failed: Tensor
 ) -> Tensor:
     """Return the reward [N] without the bonus for a goal, clipped to ±`reward_clip`.
 

@@ -248,12 +248,7 @@ class Simmer(Saute):
     """
 
     def __init__(
-        self,
-        budgets: Mapping[str, Positive],
-        *,
-        first: Fraction,
-        steps: Count,
-        **settings: Any,
+        self, budgets: Mapping[str, Positive], *, first: Fraction, steps: Count, **settings: Any
     ) -> None:
         super().__init__(budgets, **settings)
         self._first, self._steps = first, steps

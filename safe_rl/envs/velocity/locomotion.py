@@ -31,22 +31,16 @@ class Place(NamedTuple):
     reading: Callable[[mujoco.MjModel, BatchPhysics], Callable[[], Tensor]]
 
 
-def _x(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
-    return lambda: physics.qpos[:, :1].clone()
-
-
-def _torso(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
-    return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
-
-
 def _centre_of_mass(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
     shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
     return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
 
 
 PLACES: Mapping[str, Place] = {
-    "x": Place((), _x),
-    "torso": Place(("xpos",), _torso),
+    "x": Place((), lambda model, physics: lambda: physics.qpos[:, :1].clone()),
+    "torso": Place(
+        ("xpos",), lambda model, physics: lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
+    ),
     "centre_of_mass": Place(("xipos",), _centre_of_mass),
 }
 
