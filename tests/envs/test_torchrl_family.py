@@ -1,11 +1,13 @@
 """TorchRL's own environments, and somebody's for it, through the ordinary commands."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
 import torchrl_envs
 from commands import run_train
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -13,6 +15,7 @@ from safe_rl import targets
 from safe_rl.cli import evaluate, report
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.families import TORCHRL_CLASSES
+from safe_rl.envs.torchrl.step_entries import Observe
 from safe_rl.runs.table import read_table
 from safe_rl.targets import TargetError
 
@@ -134,6 +137,11 @@ def test_several_entries_become_a_vector_or_a_dictionary():
     assert parts["current_holdings"].shape == (2, 1)
     assert flat.observation_layout == nested.observation_layout
     assert flat.observation_layout["price_history"] == slice(1, 51)
+    twins = Composite(a={"x": Unbounded((2, 1))}, b={"x": Unbounded((2, 3))}, shape=(2,))
+    env = SimpleNamespace(observation_spec=twins, state_spec=Composite())
+    observe = Observe(env, {"observe": ["a.x", "b.x"], "flatten": False})  # alike names stay apart
+    assert observe.layout == {"a_x": slice(0, 1), "b_x": slice(1, 4)}
+    assert set(observe._call(twins.rand())["observation"].keys()) == {"a_x", "b_x"}
 
 
 @pytest.mark.parametrize(

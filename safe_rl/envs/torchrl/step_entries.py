@@ -94,9 +94,7 @@ class StepCosts(Transform):
                 raise ConfigError(f"There are two costs called '{name}'.")
             if not isinstance(cost, Tensor) or cost.numel() != step.batch_size.numel():
                 shown = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
-                raise ConfigError(
-                    f"The cost '{name}' must be one number per row, [N], got {shown}."
-                )
+                raise ConfigError(f"The cost '{name}' must be one number per row, got {shown}.")
             costs[name] = cost.float().reshape(*step.batch_size, 1)
         total = costs.pop(COST) if COST in costs else torch.stack(list(costs.values())).sum(0)
         return {COST: total, **costs}
@@ -165,7 +163,7 @@ class Observe(Transform):
             one vector.
 
     Attributes:
-        layout: Columns of every entry, as if all of them were one vector.
+        layout: Columns of every entry in one vector. `a.b` is called b, or a_b if two end in b.
     """
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
@@ -181,11 +179,16 @@ class Observe(Transform):
         # what the environment needs for its next step stays where it is
         needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
         self._moved = [entry_key(name) for name in self._specs if name not in needed]
-        self.layout = add_columns({}, {_last(name): _size(s) for name, s in self._specs.items()})
+        last = [name.rpartition(".")[2] for name in self._specs]
+        self._names = {
+            name: name.replace(".", "_") if last.count(end) > 1 else end
+            for name, end in zip(self._specs, last, strict=True)
+        }
+        self.layout = add_columns({}, {self._names[n]: _size(s) for n, s in self._specs.items()})
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         values = {
-            _last(name): _numbers(next_tensordict[entry_key(name)], spec)
+            self._names[name]: _numbers(next_tensordict[entry_key(name)], spec)
             for name, spec in self._specs.items()
         }
         after = next_tensordict.exclude(*self._moved)
@@ -204,7 +207,7 @@ class Observe(Transform):
         """Add `observation`, and remove the entries that are moved there."""
         shape, device = observation_spec.shape, observation_spec.device
         parts = {
-            _last(name): spec
+            self._names[name]: spec
             if _is_picture(spec)
             else Unbounded((*shape, _size(spec)), device=device)
             for name, spec in self._specs.items()
@@ -240,10 +243,6 @@ def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, Tens
     if not chosen:
         raise ConfigError(f"env.observe: choose among {', '.join(known) or 'no entries at all'}.")
     return {name: known[name] for name in chosen}
-
-
-def _last(name: str) -> str:
-    return name.rpartition(".")[2]
 
 
 def _is_picture(spec: TensorSpec) -> bool:
