@@ -30,9 +30,7 @@ class ReportOptions:
     algos: str | None = option(None, "algorithms to report, such as cpo,ppo_lagrangian; null: all")
     formats: str = option("png", "of the pictures, such as png,svg,pdf")
     unfinished: bool = option(False, "include unfinished runs in scores")
-    archive: str | None = option(
-        None, "campaign archive to add the runs to, for others; null: none"
-    )
+    archive: str | None = option(None, "campaign archive to add the runs to; null: none")
     title: str | None = option(None, "heading; null: the folder's name")
 
 
@@ -70,7 +68,10 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         unfinished=options.unfinished,
         algorithms=algorithms,
     )
-    return result, write_report(result, out, options.title or root.resolve().name, formats)
+    page = write_report(result, out, options.title or root.resolve().name, formats)
+    if options.archive is not None:
+        archive_runs(result.runs, root, Path(options.archive))
+    return result, page
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
@@ -84,7 +85,6 @@ def carry_out(words: list[str], options: ReportOptions, modules: list[str] | Non
     root = Path(words[0])
     result, page = report(root, options)
     if options.archive is not None:
-        archive_runs(result.runs, root, Path(options.archive))
         print(f"kept {len(result.runs)} runs in {options.archive}")
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {reason}", file=sys.stderr)

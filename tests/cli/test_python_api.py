@@ -307,7 +307,8 @@ def test_a_run_shows_itself(tmp_path):
     assert page.startswith("<pre>Run(&#x27;")
     assert 'src="data:image/png;base64,' in page
     assert "episode_return" in str(safe_rl.evaluate(run, episodes=2))
-    assert safe_rl.report(tmp_path).is_file()
+    assert safe_rl.report(tmp_path, archive=f"{tmp_path}_kept").is_file()
+    assert tmp_path.with_name(f"{tmp_path.name}_kept").is_dir()
 
 
 def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
