@@ -23,7 +23,7 @@ from torch import Tensor
 
 from safe_rl.objectives import PPOLoss, RiskMeasure
 from safe_rl.objectives.risk import Charges, cost_so_far
-from safe_rl.objectives.violation import violation_of
+from safe_rl.objectives.violation import constraint_value, violation_of
 
 
 class QuadraticPenaltyLoss(PPOLoss):
@@ -40,7 +40,7 @@ class QuadraticPenaltyLoss(PPOLoss):
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)  # [k]
         violation = violation_of(self.constraints, surrogates)
-        excess = surrogates + violation / self.constraints.episode_length
+        excess = surrogates + constraint_value(violation, self.constraints.episode_length, True)
         penalty = self.strength * excess.relu().square().sum()
         return super()._surrogates(tensordict, log_weight) | {"loss_penalty": penalty}
 

@@ -15,8 +15,7 @@ from safe_rl.models import make_actor
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
 
-ROOT = CONF.parent
-EXAMPLES = ROOT / "examples"
+EXAMPLES = CONF.parent / "examples"
 import_modules([str(EXAMPLES / "custom_loss.py")])
 
 import custom_loss  # noqa: E402
@@ -27,14 +26,15 @@ allow("custom_loss")
 def test_the_penalty_of_a_policy_that_has_not_moved():
     actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
     constraints = Constraints({"cost_hazards": 10.0, "cost_vases_contact": 5.0})
-    constraints.violation.copy_(torch.tensor([20.0, -3.0]))
-    constraints.episode_length.fill_(100.0)
     loss = custom_loss.QuadraticPenaltyLoss(
         actor, constraints, strength=100.0, clip_epsilon=0.2, entropy_coeff=0.0
     )
     with torch.no_grad():
         batch = actor(TensorDict(observation=torch.randn(50, 3), batch_size=[50]))
     batch["advantage"], batch["cost_advantage"] = torch.randn(50, 1), torch.zeros(50, 2)
+    assert loss(batch)["loss_penalty"] == 0  # no episode has ended, as in a loop of one's own
+    constraints.violation.copy_(torch.tensor([20.0, -3.0]))
+    constraints.episode_length.fill_(100.0)
     torch.testing.assert_close(loss(batch)["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))
 
 
