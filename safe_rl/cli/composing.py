@@ -66,8 +66,7 @@ def compose_jobs(
     if sweep and any(override.key_or_group == "hydra.run.dir" for override in overrides):
         raise CommandLineError("hydra.run.dir is for a single run: write hydra.sweep.dir with -m.")
     with hydra_on_conf():
-        jobs = list(_jobs(overrides)) if sweep else [list(texts)]
-        configs = [_compose(job) for job in jobs]
+        configs = list(map(_compose, list(_jobs(overrides)) if sweep else [list(texts)]))
     for config in [] if shown else configs:
         _check(config, overrides)
     return configs
@@ -145,8 +144,7 @@ def _check_form(overrides: Sequence[Override]) -> None:
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
     """Overrides of a few jobs in which every value of a sweep occurs."""
     values = [_sweep_lines(override) for override in overrides]
-    first = [of_one[0] for of_one in values]
-    yield first
+    yield (first := [of_one[0] for of_one in values])
     for place, of_one in enumerate(values):
         yield from ([*first[:place], value, *first[place + 1 :]] for value in of_one[1:])
 
@@ -187,9 +185,9 @@ def _explain(error: Exception, texts: Sequence[str]) -> str:
     group, _, name = error.missing_cfg_file.rpartition("/")
     # for a list of choices, such as transforms=[…], Hydra's error has no options
     known = error.options or GlobalHydra.instance().config_loader().get_group_options(group)
-    listed = f" There are {', '.join(known)}." if len(known) <= _MOST_LISTED else (
-        " 'python train.py --help' names all; a file of yours needs --config-dir=FOLDER."
-    )  # fmt: skip
+    all_of_them = f"There are {', '.join(known)}"
+    listed = all_of_them if len(known) <= _MOST_LISTED else "'python train.py --help' names all"
+    listed = f" {listed}; a file of yours needs --config-dir=FOLDER."
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     file = re.match(r"In '(?!config')([^']+)'", words)
     if file and group != "preset" and f"preset={name}" in texts:  # the preset chose the file

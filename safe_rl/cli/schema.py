@@ -187,7 +187,10 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
     if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
         return f"there is no key '{key}'.{reason}"
     if choice := _choice_with(key):
-        return f"there is no key '{key}' without {choice}."
+        target = str((values.get(section) or {}).get("_target_") or "safe_rl.")
+        own = f": {target} has no such argument. Choose your class by a YAML file ({section}=…)."
+        reason = f" without {choice}." if target.startswith("safe_rl.") else own
+        return f"there is no key '{key}'{reason}"
     known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(algo))
     read = [path for path in known if path != key and not f"{path}.".startswith(unread)]
     held = [path for path in read if known[path]]
@@ -221,9 +224,8 @@ def _choice_with(key: str) -> str | None:
     for file in sorted((CONF / section).glob("*.yaml")) if rest else ():
         held = flatten(OmegaConf.to_container(OmegaConf.load(file)))  # type: ignore[arg-type]
         if any(f"{path}.".startswith((f"{rest}.", f"{key}.")) for path in held):
-            return (
-                f"{section}=[{file.stem}]" if section == "transforms" else f"{section}={file.stem}"
-            )
+            name = f"[{file.stem}]" if section == "transforms" else file.stem
+            return f"{section}={name}"
     return None
 
 

@@ -62,7 +62,7 @@ WRONG = {
     "model.memory.size=8": r"without model=gru\.$",
     "transforms.saute.budgets={cost: 3}": r"without transforms=\[saute\]\.$",
     # choices that are none, or too many
-    "algo=": r"no algo ''\. There are bc, ",
+    "algo=": r"no algo ''\. There are bc, .*; a file of yours needs --config-dir=FOLDER\.$",
     "algo=[cpo,ppo]": r"a run has one algo; for a run with each of them: -m algo=cpo,ppo$",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
