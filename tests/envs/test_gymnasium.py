@@ -79,14 +79,15 @@ def test_any_configuration_can_be_made():
     assert "cost_hazards" in env.step(env.action_space.sample())[-1]
     changed = gymnasium.make("Safexp-PointGoal1-v0", config={"lidar_num_bins": 8})
     assert changed.observation_space.shape == (12 + 3 * 8,)
-    with pytest.raises(ConfigError, match="Did you mean 'hazards_num'"):
-        gymnasium.make("Safexp-Custom-v0", config={"hazard_num": 2})
-    with pytest.raises(ConfigError, match="Did you mean 'velocity_threshold'"):
-        gymnasium.make("SafeHopperVelocity-v0", config={"velocity_treshold": 1.0})
-    with pytest.raises(TypeError, match=r"config=\{'hazards_num': …\}"):
-        gymnasium.make("Safexp-PointGoal1-v0", hazards_num=3)
-    with pytest.raises(ValueError, match="render_mode must be one of"):
-        gymnasium.make("SafeHopperVelocity-v0", render_mode="ansi", disable_env_checker=True)
+    for told, name, given in (
+        ("Did you mean 'hazards_num'", "Safexp-Custom", {"config": {"hazard_num": 2}}),
+        (r"is a name: .*make_env\('PointRun'\)", "Safexp-Custom", {"config": "PointRun"}),
+        ("mean 'velocity_threshold'", "SafeHopperVelocity", {"config": {"velocity_treshold": 1}}),
+        (r"config=\{'hazards_num': …\}", "Safexp-PointGoal1", {"hazards_num": 3}),
+        ("render_mode must be one of", "SafeHopperVelocity", {"render_mode": "ansi"}),
+    ):
+        with pytest.raises((ConfigError, TypeError, ValueError), match=told):
+            gymnasium.make(f"{name}-v0", disable_env_checker=True, **given)
 
 
 @needs_opengl

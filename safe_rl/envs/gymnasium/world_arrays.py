@@ -15,6 +15,7 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
+from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
@@ -55,8 +56,7 @@ class Worlds:
         positions: bool = False,
         **unknown: Any,
     ) -> None:
-        if unknown:
-            name = next(iter(unknown))
+        for name in unknown:
             raise TypeError(f"There is no argument '{name}': put keys into config={{'{name}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
@@ -105,9 +105,8 @@ class Worlds:
 
     def _reset(self, mask: np.ndarray | None = None) -> Observation:
         """Start episodes in all rows or in those of a mask [N]; return the observation of all."""
-        ask = None
-        if mask is not None:
-            ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
+        new = None if mask is None else torch.from_numpy(mask).unsqueeze(-1)
+        ask = None if new is None else TensorDict({"_reset": new}, len(new))
         # TorchRL's `reset` would return zeros for the other rows
         return arrays_of(self.batch._reset(ask)["observation"])
 
@@ -140,6 +139,8 @@ def batch_of(
     sleep: bool,
 ) -> SimulatedEnv:
     """Make the environments of a name with some keys changed, or of a whole configuration."""
+    if isinstance(config, str):
+        raise ConfigError(f"config='{config}' is a name: give keys, as make_env('{config}').config")
     base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())
     whole = config if isinstance(config, SafetyGymConfig) else base.replace(**(config or {}))
     if num_steps is not None:
