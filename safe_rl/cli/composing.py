@@ -66,7 +66,8 @@ def compose_jobs(
     if sweep and any(override.key_or_group == "hydra.run.dir" for override in overrides):
         raise CommandLineError("hydra.run.dir is for a single run: write hydra.sweep.dir with -m.")
     with hydra_on_conf():
-        configs = list(map(_compose, list(_jobs(overrides)) if sweep else [list(texts)]))
+        jobs = list(_jobs(overrides)) if sweep else [list(texts)]
+        configs = [_compose(job) for job in jobs]
     for config in [] if shown else configs:
         _check(config, overrides)
     return configs
@@ -144,7 +145,8 @@ def _check_form(overrides: Sequence[Override]) -> None:
 def _jobs(overrides: Sequence[Override]) -> Iterator[list[str]]:
     """Overrides of a few jobs in which every value of a sweep occurs."""
     values = [_sweep_lines(override) for override in overrides]
-    yield (first := [of_one[0] for of_one in values])
+    first = [of_one[0] for of_one in values]
+    yield first
     for place, of_one in enumerate(values):
         yield from ([*first[:place], value, *first[place + 1 :]] for value in of_one[1:])
 

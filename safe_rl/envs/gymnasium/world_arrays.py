@@ -56,7 +56,8 @@ class Worlds:
         positions: bool = False,
         **unknown: Any,
     ) -> None:
-        for name in unknown:
+        if unknown:
+            name = next(iter(unknown))
             raise TypeError(f"There is no argument '{name}': put keys into config={{'{name}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
