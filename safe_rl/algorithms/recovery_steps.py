@@ -52,7 +52,7 @@ class CTRPOStep(TRPOStep):
 
     A policy above a limit recovers: it takes steps like those of `TRPOStep` that lower E[ρ A_c],
     until J_c is (1 − `hysteresis`) d below its target, which is d minus a margin if there is one.
-    Barriers of costs within their limits stay active. If several limits are violated, the cost that
+    Barriers of other costs stay active. If the policy recovers from several costs, the one that
     exceeds its limit most is lowered first. A limit of 0 has no barrier, and a batch without any
     cost starts no recovery.
 
@@ -104,13 +104,13 @@ class CTRPOStep(TRPOStep):
 
     def _propose(self, problem: StepProblem) -> Proposal:
         surrogates, violation, length = problem.surrogates, problem.violation, problem.length
-        above = violation - self.recovered.to(violation)
-        was_recovering = self.recovering.to(violation.device) & (above >= 0)
+        is_above = violation >= self.recovered.to(violation)
+        was_recovering = self.recovering.to(violation.device) & is_above
         costs_anything = violation > -self.limits.to(violation)
         self.recovering = ((violation >= 0) | was_recovering) & costs_anything
         inside = ~self.recovering & (violation < 0)
         slack, start = -violation[inside], length * surrogates[inside].detach()
-        worst = int(above.masked_fill(~self.recovering, -torch.inf).argmax())
+        worst = int(violation.masked_fill(~self.recovering, -torch.inf).argmax())
         recovers = self.recovering.any()
         objective = (lambda of: of["cost_surrogate"][worst]) if recovers else total_loss
         loss = objective(problem.losses)
