@@ -28,9 +28,6 @@ class CPOStep(TRPOStep):
     takes the first fraction with KL(π_θ ‖ π_k) ≤ δ and L_c(new) − L_c(old) ≤ max(−c, 0). In cases
     2 to 4, in which the policy keeps its limits, the loss must also not be worse.
 
-    The violations are arguments of the call. They can be from any estimate of J_c: the mean over
-    finished episodes, or, if a batch is shorter than its episodes, its cost rate times T̄.
-
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].

@@ -104,11 +104,9 @@ class TRPOStep(PolicyUpdate):
     the policy plus damping. A backtracking line search takes its first fraction with
     KL(π_θ ‖ π_k) ≤ δ that does not worsen the loss. If there is none, the policy does not change.
 
-    The loss may be any callable from a batch to a TensorDict with scalars ``loss_…``, for example
-    a surrogate of your own; their sum is minimised.
-
     Args:
-        loss: The loss; a `TRPOLoss`, a `TRPOLagrangianLoss` or your own.
+        loss: A `TRPOLoss`, or a callable of your own that returns a TensorDict with scalars
+            ``loss_…``, whose sum is minimised.
         target_kl: Radius δ of the trust region, mean KL divergence over the states of the batch.
         damping: Multiple of the identity added to the Fisher matrix.
         cg_iterations: Iterations of the conjugate gradient method, for every linear system.
