@@ -6,6 +6,7 @@ Defaults are in ``conf/``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
@@ -154,16 +155,28 @@ def check_settings(config: DictConfig) -> None:
         TargetError: For a part that may not be named or does not exist.
     """
     values = plain(config)
+    rows = []
     for path, node, part in _nodes(values):
         for name, value in node.items():
             key = join_keys(path, name)
             if name in part.rows:
-                row = part.rows[name]
-                row.check(key, value)
-                if row.values.whole:
-                    (OmegaConf.select(config, path) if path else config)[name] = _whole(value)
+                rows.append((_origin(config, key), key, path, value, part.rows[name]))
             elif part.names is not None and name not in part.names and str(name)[0] != "_":
                 raise SettingError(unknown_key(key, values))
+    # copied values last: the range of the key that was given comes before those of its copies
+    for origin, key, path, value, row in sorted(rows, key=lambda each: each[0] != each[1]):
+        row.check(origin, value)
+        if row.values.whole:
+            section = OmegaConf.select(config, path) if path else config
+            section[key.removeprefix(f"{path}.")] = _whole(value)
+
+
+def _origin(config: DictConfig, key: str) -> str:
+    """The key that a value is copied from, as in ``max_kl: ${loss.max_state_kl}``, or `key`."""
+    section, _, name = key.rpartition(".")
+    raw: Any = (OmegaConf.select(config, section) if section else config)._get_node(name)
+    copied = re.fullmatch(r"\$\{(\w[\w.]*)\}", str(raw._value()))
+    return _origin(config, copied[1]) if copied else key
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

@@ -141,16 +141,13 @@ def test_no_value_ends_in_a_traceback():
     ("path", "value", "words"),
     [
         ("frames", "abc", "frames=abc: it must be a whole number from 1 to "),
-        ("seed", -1, "seed=-1: it must be a whole number from 0"),
         ("seed", True, "seed=true"),
-        ("checkpoint.interval", "abc", "checkpoint.interval=abc: it must be a number from 0"),
         ("model.hidden_sizes", 64, "model.hidden_sizes=64: it must be a list"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be a number from 0 to 1 (discount"),
         ("policy_update.max_kl", -1, "policy_update.max_kl=-1: it must be a number above 0"),
         ("policy_update.adapt_rate", 3, "policy_update.adapt_rate=3: it must be a part"),
         ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be a number above 1"),
         ("loss.clip_epsilon", math.nan, "loss.clip_epsilon=nan: it must be"),
-        ("lagrangian.highest", "foo", "lagrangian.highest=foo: it must be a number above 0"),
         ("model.initial_log_std", None, "model.initial_log_std=null: it must be"),
         ("model.hidden_sizes", [10**9], "model.hidden_sizes=[1000000000]: it must be a list"),
         ("init_from", 3, "init_from=3: it must be a text"),
@@ -159,14 +156,17 @@ def test_no_value_ends_in_a_traceback():
         ("seed", 1e30, "seed=1e+30: it must be a whole number from 0 to"),
         ("compile", "maybe", "compile=maybe: it must be true or false"),
         ("device", "cuda:99", "device=cuda:99: it must be cpu; or cuda or cuda:<number>, if torch"),
-        ("limits.margin", "abc", "margin=abc: it must be a number from 0 to 1e+09 (how far below"),
-        ("env.name", "", "env.name=: it must be a text"),
         ("env.name", "a/b", "env.name=a/b: it must be"),
         ("cost_limits", {"cost": math.inf}, "cost_limits={'cost': inf}: it must be a mapping"),
     ],
 )
 def test_refusals_name_the_key_and_what_it_may_hold(path, value, words):
     assert words in outcome(config_of("ppo_lagrangian"), path, value)
+
+
+def test_refusals_name_the_key_that_a_value_is_copied_from():
+    assert "loss.max_state_kl=0: " in outcome(config_of("focops"), "loss.max_state_kl", 0)
+    assert "cost_advantage.gamma=1: " in outcome(config_of("cup"), "cost_advantage.gamma", 1)
 
 
 @pytest.mark.parametrize(
