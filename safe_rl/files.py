@@ -240,14 +240,6 @@ def check_no_links(folder: Path) -> None:
 
     Raises:
         ValueError: If there is a link; the message names the first one.
-
-    Examples:
-        >>> folder = getfixture("tmp_path")
-        >>> (folder / "transitions").symlink_to("/etc")
-        >>> check_no_links(folder)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        ValueError: .../transitions is a link: nothing is written or removed where links could ...
     """
     for place, folders, files in os.walk(folder):
         link = next((n for n in (*folders, *files) if os.path.islink(Path(place, n))), None)
@@ -269,12 +261,6 @@ def check_place(path: Path, otherwise: str) -> None:
 
     Raises:
         OSError: If it is a folder, or cannot be made.
-
-    Examples:
-        >>> check_place(getfixture("tmp_path"), "Take another name.")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        IsADirectoryError: ... is a folder, where a file is to be written. Take another name.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder, where a file is to be written. {otherwise}")

@@ -20,16 +20,6 @@ def import_later(
     Args:
         package: Name of the package.
         homes: Module, named from the package -> names that it defines.
-
-    Examples:
-        >>> find, names = import_later("safe_rl", {"naming": ["nearest"]})
-        >>> find("nearest")("cop", ["cpo"])
-        'cpo'
-        >>> "nearest" in names()
-        True
-        >>> find("root")
-        Traceback (most recent call last):
-        AttributeError: module 'safe_rl' has no attribute 'root'
     """
     modules = {name: f"{package}.{home}" for home, names in homes.items() for name in names}
 

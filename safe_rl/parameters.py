@@ -25,20 +25,7 @@ class Parameter(NamedTuple):
         values: The values that it may have.
         meaning: Its description in the docstring, a sentence without its full stop.
         is_described: Whether its annotation describes a hyper-parameter, not only a type.
-
-    Examples:
-        >>> from safe_rl.ranges import Share
-        >>> def discounted(rewards, gamma: Share = 0.99):
-        ...     '''Sum rewards.
-        ...
-        ...     Args:
-        ...         gamma: Discount per step.
-        ...     '''
-        >>> parameters_of(discounted)["gamma"].check("gamma", 2)
-        Traceback (most recent call last):
-        ...
-        safe_rl.parameters.SettingError: gamma=2: it must be a number from 0 to 1 (discount per step).
-    """  # noqa: E501
+    """
 
     values: Values
     meaning: str

@@ -130,20 +130,7 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
     Raises:
         CommandLineError: If an option is unknown (the message names the nearest one), has no value,
             or has a value of another type than in the schema.
-
-    Examples:
-        >>> from dataclasses import dataclass
-        >>> @dataclass
-        ... class Options:
-        ...     episodes: int = 100
-        ...     video: bool = False
-        >>> parse_options(["episodes=7", "video=true"], Options)
-        Options(episodes=7, video=True)
-        >>> parse_options(["episode=7"], Options)
-        Traceback (most recent call last):
-        ...
-        safe_rl.cli.grammar.CommandLineError: Unknown option 'episode'. Did you mean 'episodes'? Options are: episodes, video.
-    """  # noqa: E501
+    """
     kinds = get_type_hints(schema)
     read = OmegaConf.create()
     for argument in arguments:

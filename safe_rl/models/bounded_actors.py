@@ -106,13 +106,6 @@ class SquashedNormal(TanhNormal):
         scale: Standard deviations, [..., A].
         low: Lower bounds, [A].
         high: Upper bounds, [A].
-
-    Examples:
-        >>> bounds = torch.tensor([-1.0]), torch.tensor([3.0])
-        >>> policy = SquashedNormal(torch.zeros(5, 1), torch.ones(5, 1), *bounds)
-        >>> action, log_prob = policy.rsample_and_log_prob()
-        >>> torch.allclose(log_prob, policy.log_prob(action), atol=1e-4)
-        True
     """
 
     def __init__(self, loc: Tensor, scale: Tensor, low: Tensor, high: Tensor) -> None:

@@ -101,13 +101,6 @@ class Body(nn.Module):
         hidden_sizes: Widths of its hidden layers.
         extra: Number of further inputs, which follow the entries and are not encoded.
         device: Device of the parameters.
-
-    Examples:
-        >>> import torch
-        >>> entry = Entry(("observation", "gyro"), "gyro", (3,), False)
-        >>> observed = Observed([entry], {}, {}, clip=None, encoders={"vector": [8]})
-        >>> Body(observed, 2, [16])(torch.zeros(5, 3)).shape
-        torch.Size([5, 2])
     """
 
     def __init__(
@@ -208,19 +201,6 @@ class RecurrentLayer(TensorDictModuleBase):
         num_features: Number of inputs.
         size: Size of the state, and number of outputs.
         device: Device of the parameters.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> layer = RecurrentLayer(3, 4)
-        >>> steps = TensorDict(
-        ...     features=torch.ones(2, 5, 3),
-        ...     memory=torch.zeros(2, 5, 4),
-        ...     is_init=torch.zeros(2, 5, 1, dtype=torch.bool),
-        ...     batch_size=[2, 5],
-        ... )
-        >>> layer(steps)["features"].shape
-        torch.Size([2, 5, 4])
     """
 
     def __init__(self, num_features: int, size: int, *, device: torch.device | None = None) -> None:

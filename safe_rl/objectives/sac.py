@@ -43,25 +43,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
         >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
-        >>> loss = SACLoss(actor, q, gamma=0.99, alpha_init=0.1, target_entropy=-2.0)
-        >>> steps = TensorDict(
-        ...     observation=torch.randn(4, 3),
-        ...     action=torch.rand(4, 2),
-        ...     next={
-        ...         "observation": torch.randn(4, 3),
-        ...         "reward": torch.randn(4, 1),
-        ...         "done": torch.zeros(4, 1, dtype=torch.bool),
-        ...         "terminated": torch.zeros(4, 1, dtype=torch.bool),
-        ...     },
-        ...     batch_size=[4],
-        ... )
-        >>> [key for key in loss(steps).keys() if key.startswith("loss_")]
-        ['loss_qvalue', 'loss_actor', 'loss_alpha']
+        >>> SACLoss(actor, q, gamma=0.99, alpha_init=0.1, target_entropy=-2.0).out_keys
+        ['loss_qvalue', 'loss_actor', 'loss_alpha', 'alpha', 'entropy']
     """
 
     _next_action: Tensor

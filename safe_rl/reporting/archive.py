@@ -130,15 +130,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
 
 
 def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
-    """Write runs, by name, as an archive; equal runs give equal bytes.
-
-    Examples:
-        >>> folder, table = getfixture("tmp_path"), {"steps": [1000.0, 2000.0]}
-        >>> run = Run(folder / "a/seed0", {"model": {"width": 64}}, table, {"code": []})
-        >>> write_archive({"a/seed0": run}, folder)
-        >>> read_archive(str(folder))["a/seed0"] == run
-        True
-    """
+    """Write runs, by name, as an archive; equal runs give equal bytes."""
     pandas = import_extra("pandas", "report")
     runs = dict(sorted(runs.items()))
     folder.mkdir(parents=True, exist_ok=True)

@@ -87,19 +87,6 @@ class CheckpointStore:
         keep_best: Number of best checkpoints to keep.
         run: JSON-compatible facts of the run that every checkpoint holds. A checkpoint with other
             facts is refused when the run is resumed.
-
-    Examples:
-        >>> import tempfile, torch
-        >>> network = torch.nn.Linear(2, 1)
-        >>> folder = tempfile.mkdtemp()
-        >>> store = CheckpointStore(folder, {"network": network}, keep_last=2)
-        >>> for steps in (100, 200, 300):
-        ...     path = store.save(steps)
-        >>> [path.name for path in checkpoints_in(store.last)]
-        ['checkpoint-000000000200.torchrl', 'checkpoint-000000000300.torchrl']
-        >>> store.save_best(300, score=1.0), store.save_best(400, score=0.5)
-        (True, False)
-        >>> CheckpointStore.load(path, {"network": torch.nn.Linear(2, 1)})
     """
 
     def __init__(

@@ -53,13 +53,6 @@ def learning_curves(
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
         title: Title above the panels.
-
-    Examples:
-        >>> table = {"steps": [1000, 2000], "episode_return": [0.0, 1.0]}
-        >>> table |= {"episode_cost": [50.0, 30.0], "cost_rate": [0.05, 0.04]}
-        >>> figure = learning_curves(table, {"cost": 25.0}, 1000)
-        >>> save_figure(figure, getfixture("tmp_path") / "curves.png").name
-        'curves.png'
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}
     layout = ConstrainedLayoutEngine(h_pad=0.1)  # inch; the layout is a pixel or two inexact

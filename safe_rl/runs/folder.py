@@ -225,13 +225,6 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
     Raises:
         RunInUseError: If another process holds the lock.
         ValueError: If the folder holds links, which could lead writing elsewhere.
-
-    Examples:
-        >>> import tempfile
-        >>> folder = RunFolder(Path(tempfile.mkdtemp()))
-        >>> with lock_folder(folder):
-        ...     folder.lock.exists()
-        True
     """
     check_no_links(folder.directory)
     # One object per file, so that this process can lock it several times. No fallback to a file:

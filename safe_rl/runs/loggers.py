@@ -45,13 +45,6 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
 
     Raises:
         ValueError: If ``exp_name`` is no name of a folder.
-
-    Examples:
-        >>> import tempfile
-        >>> logger = TensorboardLogger(exp_name="tensorboard", log_dir=tempfile.mkdtemp())
-        >>> logger.continue_from(1000)
-        >>> logger.log_scalar("episode_return", 1.0, step=2000)
-        >>> logger.close()
     """
 
     def __init__(self, exp_name: Text, log_dir: str) -> None:

@@ -36,19 +36,6 @@ class RunRecord:
 
     Raises:
         ValueError: If ``MPLBACKEND`` names a backend that Matplotlib does not have.
-
-    Examples:
-        >>> import tempfile
-        >>> names = {"algo": {"name": "ppo"}, "env": {"name": "PointGoal1"}}
-        >>> length = {"frames": 200, "frames_per_batch": 200}
-        >>> config = OmegaConf.create({**names, **length, "seed": 0, "logger": None})
-        >>> record = RunRecord(Path(tempfile.mkdtemp()), config, {"cost": 25.0}, 1000)
-        >>> row = {"steps": 200, "episode_return": 1.0, "episode_cost": 30.0, "cost_rate": 0.03}
-        >>> with record.writing():
-        ...     record.add(row | {"time_total": 2.0})
-        ...     record.draw_curves()
-        >>> record.summary().split(" per ")[0]
-        'Return 1.00, cost 30.0 (limit 25)'
     """
 
     def __init__(

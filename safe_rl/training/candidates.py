@@ -66,20 +66,6 @@ class Candidates(Resumable):
 
     Attributes:
         waiting: The policies: ``steps`` and ``epoch`` of the run then, and ``states`` by name.
-
-    Examples:
-        >>> import functools
-        >>> import torch
-        >>> network = torch.nn.Linear(2, 1)
-        >>> delay = functools.partial(epochs_until_judged, 1, steps_per_epoch=10)
-        >>> candidates = Candidates(
-        ...     {"network": network}, {"cost": 25.0}, over=1, delay=delay, longest=10
-        ... )
-        >>> row = {"episode_return": 5.0, "episode_cost": 20.0}
-        >>> candidates.add({"epoch": 1, "steps": 100, **row})
-        []
-        >>> [(one.steps, one.score) for one in candidates.add({"epoch": 2, "steps": 200, **row})]
-        [(100, 5.0)]
     """
 
     state_names = ("waiting",)

@@ -20,14 +20,7 @@ from safe_rl.resumable import Resumable
 
 
 class Progress(Resumable):
-    """Counters of a run: epochs, environment steps, seconds of training.
-
-    Examples:
-        >>> progress = Progress()
-        >>> progress.add(steps=1000, seconds=2.0)
-        >>> progress.state_dict()
-        {'epoch': 1, 'steps': 1000, 'seconds': 2.0}
-    """
+    """Counters of a run: epochs, environment steps, seconds of training."""
 
     state_names = ("epoch", "steps", "seconds")
 
@@ -123,13 +116,6 @@ class StopRequest:
     SIGHUP is sent when a terminal is closed; if it is already ignored, as with ``nohup``, it stays
     ignored. Signals can only be caught in the main thread; in other threads this class does
     nothing.
-
-    Examples:
-        >>> import signal
-        >>> with StopRequest() as stop:
-        ...     signal.raise_signal(signal.SIGTERM)
-        ...     stop.received is signal.SIGTERM
-        True
     """
 
     _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})

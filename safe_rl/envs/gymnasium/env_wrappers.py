@@ -75,15 +75,6 @@ class SixValues(gymnasium.Wrapper):
     """An environment whose step returns (observation, reward, cost, terminated, truncated, info).
 
     The wrapper's step returns Gymnasium's five values, with the cost in `info`.
-
-    Examples:
-        >>> class Slide(gymnasium.Env):
-        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,))
-        ...     action_space = gymnasium.spaces.Box(-1, 1, (1,))
-        ...     def step(self, action):
-        ...         return action, 1.0, float(action[0] > 0), False, False, {"cost_ice": 0.0}
-        >>> SixValues(Slide()).step([0.5])[-1]
-        {'cost_ice': 0.0, 'cost': 1.0}
     """
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -44,13 +44,6 @@ class BatchPhysics(Physics):
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
         outputs: Names of the fields of `MjData` that are read; every call copies them.
-
-    Examples:
-        >>> from safe_rl.envs.safety_gym.building import build_scene
-        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
-        >>> physics = BatchPhysics(build_scene(SafetyGymConfig()).model, num_envs=2, num_threads=1)
-        >>> physics.step(num_substeps=10).tolist()
-        [False, False]
     """
 
     device = torch.device("cpu")

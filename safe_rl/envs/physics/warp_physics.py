@@ -57,14 +57,6 @@ class WarpPhysics(Physics):
 
     Raises:
         NotImplementedError: If the model uses a feature that MuJoCo Warp lacks.
-
-    Examples:
-        >>> from safe_rl.envs.safety_gym.building import build_scene
-        >>> from safe_rl.envs.safety_gym.config import SafetyGymConfig
-        >>> model = build_scene(SafetyGymConfig()).model
-        >>> physics = WarpPhysics(model, 2, "cpu", contacts=32, constraints=128)
-        >>> physics.step(num_substeps=10).tolist()
-        [False, False]
     """
 
     dtype = torch.float32

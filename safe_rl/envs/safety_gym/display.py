@@ -25,13 +25,6 @@ class Display(Pictures):
 
     Args:
         config: The configuration of the environment.
-
-    Examples:
-        >>> from safe_rl.envs import SafetyGymEnv
-        >>> env = SafetyGymEnv("PointGoal1", seed=0)
-        >>> _ = env.reset()
-        >>> env.render(rows=0, camera="track", width=60, height=40).shape
-        (40, 60, 3)
     """
 
     def __init__(self, config: SafetyGymConfig) -> None:
