@@ -21,9 +21,6 @@ def prefers_onednn(cpuinfo: str) -> bool:
     for products of minibatches. torch uses oneDNN only if products may be rounded to bfloat16.
     oneDNN really rounds only on processors with tile registers (AMX).
 
-    Args:
-        cpuinfo: Text of ``/proc/cpuinfo`` on Linux.
-
     Examples:
         >>> prefers_onednn("vendor_id : AuthenticAMD flags : fpu avx2 avx512f")
         True
@@ -76,14 +73,8 @@ def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[An
 
     With narrow networks, the computations of one minibatch are too small for two threads, so it is
     faster to run two updates at the same time. With one thread, the second function follows the
-    first. TorchRL's exploration type is DETERMINISTIC meanwhile, as in its losses.
-
-    Args:
-        first: Called in this thread.
-        second: Called in a thread of its own.
-
-    Returns:
-        The two results. Both functions have ended, even if one of them raises an error.
+    first. TorchRL's exploration type is DETERMINISTIC meanwhile, as in its losses. Both functions
+    have ended on return, even if one of them raises an error.
     """
     threads = torch.get_num_threads()
     # Losses set the exploration type, of which a process has only one, and then restore it. In two

@@ -33,14 +33,9 @@ def _spread(counter: Tensor | int) -> Tensor | int:
 
 
 def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
-    """Hash keys with counters, one counter after the other, into new keys.
+    """Hash int64 keys with counters, one after the other, into int64 keys of the broadcast shape.
 
-    Args:
-        key: int64 keys of any shape.
-        counters: Integers or int64 tensors that broadcast with `key`.
-
-    Returns:
-        int64 keys of the broadcast shape, uniform over all 64-bit values.
+    The new keys are uniform over all 64-bit values.
 
     Examples:
         >>> fold(torch.tensor([1, 1]), torch.tensor([0, 0])).unique().numel()

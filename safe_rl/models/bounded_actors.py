@@ -99,13 +99,7 @@ class SquashedNormal(TanhNormal):
     """A `TanhNormal` that is built when a method other than `rsample_and_log_prob` is called.
 
     Soft actor-critics only call this method, twice per update. Building the transforms and checking
-    the bounds takes six times as long.
-
-    Args:
-        loc: Means before the tanh, [..., A].
-        scale: Standard deviations, [..., A].
-        low: Lower bounds, [A].
-        high: Upper bounds, [A].
+    the bounds takes six times as long. ``loc`` and ``scale``, [..., A], are those before the tanh.
     """
 
     def __init__(self, loc: Tensor, scale: Tensor, low: Tensor, high: Tensor) -> None:

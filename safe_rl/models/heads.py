@@ -144,12 +144,7 @@ class BoundedBeta(distributions.Independent):
     """A Beta distribution in each component of an action between bounds (Chou et al. 2017).
 
     Its KL divergence is that of the Beta distributions, because it does not depend on the bounds.
-
-    Args:
-        alpha: First concentrations, [..., A].
-        beta: Second concentrations, [..., A].
-        low: Lower bounds, [A].
-        high: Upper bounds, [A].
+    The concentrations ``alpha`` and ``beta`` are [..., A], the bounds [A].
 
     Examples:
         >>> import torch

@@ -15,15 +15,9 @@ from safe_rl.objectives.samples import require, sample_mask
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
-    """1 − Var(target − prediction) / Var(target), per column.
+    """1 − Var(target − prediction) / Var(target), per column: [..., F] -> [F].
 
-    Args:
-        prediction: Predicted values, [..., F].
-        target: Values to be predicted, [..., F].
-
-    Returns:
-        One number per column, [F]: 1 is perfect, 0 no better than a constant. It is also 0 for a
-        constant target.
+    1 is perfect, 0 no better than a constant. It is also 0 for a constant target.
     """
     residual = (target - prediction).flatten(0, -2).var(0, correction=0)
     total = target.flatten(0, -2).var(0, correction=0)

@@ -34,17 +34,7 @@ from torchrl.modules.distributions.utils import sample_and_log_prob
 
 
 def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) -> Tensor:
-    """KL(p ‖ q) of diagonal Gaussians, summed over the last dimension.
-
-    Args:
-        loc_p: Mean of p, [..., n].
-        scale_p: Standard deviation of p, [..., n].
-        loc_q: Mean of q, [..., n].
-        scale_q: Standard deviation of q, [..., n].
-
-    Returns:
-        Divergence in nats, [...].
-    """
+    """KL(p ‖ q) of diagonal Gaussians, in nats, summed over components: [..., n] -> [...]."""
     ratio = (scale_p / scale_q).square()
     shift = ((loc_p - loc_q) / scale_q).square()
     return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
@@ -88,10 +78,8 @@ def composite_log_probs(
 ) -> tuple[Tensor, Tensor]:
     """Joint log-probability of the parts' actions now, and the stored joint one, [...] each.
 
-    Args:
-        composite: Distribution in the states of the batch.
-        batch: Batch with the actions, under the keys of the parts.
-        stored: Keys of the parts' stored log-probabilities.
+    The batch has the actions under the keys of the parts, and their log-probabilities under the
+    keys `stored`.
     """
     states, parts = composite.batch_shape, composite.dists.items()
     now = _total((part.log_prob(batch[key]) for key, part in parts), states)
@@ -124,9 +112,6 @@ def kl(
         q: Distribution in the same states.
         log_weight: Log ρ of the sampled actions, [...].
         batch: The sampled actions, under the keys of the parts; for composite distributions only.
-
-    Returns:
-        Divergence in nats, [...].
     """
     if isinstance(p, CompositeDistribution):
         assert batch is not None

@@ -15,11 +15,9 @@ from safe_rl.objectives.samples import FIRST, require, sample_mask
 
 
 def trajectory_ends(done: Tensor, mask: Tensor | None) -> Tensor:
-    """Where the trajectories of a rollout end, [..., T] bool.
+    """Where the trajectories of a rollout end, [..., T] bool, from ``done`` [..., T, 1].
 
-    Args:
-        done: Whether an episode ended, [..., T, 1] bool.
-        mask: [..., T] bool, False where the rollout is padded; None without padding.
+    The mask [..., T] is False where the rollout is padded; None without padding.
     """
     ends = done.squeeze(-1).clone()
     ends[..., -1] = True
@@ -67,19 +65,10 @@ def gae(
     gamma: float,
     lmbda: float,
 ) -> Tensor:
-    """Generalised advantage estimate (Schulman et al. 2016, equation 16).
+    """Generalised advantage estimates (Schulman et al. 2016, equation 16), [..., T, F].
 
-    Args:
-        reward: [..., T, F], F reward-like signals.
-        value: [..., T, F], values of the observations.
-        next_value: [..., T, F], values of the next observations.
-        done: [..., T, 1] bool, trajectory ends.
-        terminated: [..., T, 1] bool, ends after which values are not bootstrapped.
-        gamma: Discount per step.
-        lmbda: Decay of the TD errors.
-
-    Returns:
-        Advantages, [..., T, F].
+    Rewards and the values of observations and next observations are [..., T, F]; ``done`` (ends of
+    trajectories) and ``terminated`` (ends after which values are not bootstrapped) are [..., T, 1].
     """
     if gamma * lmbda == 0:
         # With a decay of 0, TorchRL's function loses even the first TD error.

@@ -100,12 +100,8 @@ class P3OLoss(PenaltyLoss):
 def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tensor:
     """−κ log(slack), continued by its tangent where its slope would exceed ``max_weight``.
 
-    The tangent begins at slack = κ / max_weight, so that value and slope are continuous.
-
-    Args:
-        slack: Distance to the limit, negative beyond it, any shape.
-        kappa: Strength κ > 0 of the barrier, a scalar.
-        max_weight: Largest slope > 0.
+    The tangent begins at slack = κ / max_weight, so that value and slope are continuous. The slack
+    is the distance to the limit, negative beyond it.
 
     Examples:
         >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)

@@ -18,10 +18,7 @@ _SMALLEST = 1e-8
 
 
 def gaussian_tail(tail: float) -> float:
-    """CVaR_α of a standard Gaussian, α⁻¹ φ(Φ⁻¹(α)): the mean of the largest fraction α.
-
-    Args:
-        tail: α in (0, 1].
+    """CVaR_α of a standard Gaussian, α⁻¹ φ(Φ⁻¹(α)): the mean of the largest fraction α in (0, 1].
 
     Examples:
         >>> round(gaussian_tail(0.5), 4), gaussian_tail(1.0)

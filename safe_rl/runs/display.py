@@ -1,4 +1,8 @@
-"""Output on the terminal: a progress bar during training, and a line at the end."""
+"""Output on the terminal: a progress bar during training, and a line at the end.
+
+`limits` are d, the undiscounted cost allowed per episode, by cost key. `episode_length` is the
+largest number of steps of an episode.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +30,6 @@ class ProgressBar:
         directory: Folder of the run; if lines replace the bar, they begin with its name.
         total: Environment steps of the whole run.
         begun: Steps that a continued run has made before.
-        limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: Largest number of steps of an episode.
     """
 
     def __init__(
@@ -76,11 +78,6 @@ def shown(
     those of all steps so far, per 1,000 steps. While an algorithm lowers its limit, the word
     "target" precedes the present one.
 
-    Args:
-        row: Row of a run's table, by column.
-        limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: Largest number of steps of an episode; it turns limits into rates.
-
     Examples:
         >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
         >>> shown(row, {"cost": 25.0})
@@ -127,11 +124,6 @@ def outcome_line(
     table: Mapping[str, Sequence[float]], limits: Mapping[str, float], episode_length: int
 ) -> str:
     """One line about the end of a run: return and costs over its last epochs.
-
-    Args:
-        table: Columns of the run's table.
-        limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: Largest number of steps of an episode.
 
     Examples:
         >>> table = {"steps": [1000, 2000], "time_total": [2.0, 4.0], "cost_rate": [0.03, 0.03]}

@@ -1,6 +1,8 @@
 """Final figures of a run, and its violations of limits.
 
-The best checkpoints, the terminal, the curves and the report use them.
+The best checkpoints, the terminal, the curves and the report use them. A `row` is one epoch of a
+run's table, or its final figures, by column; a `table` is the whole table by columns. A `limit` is
+d, the undiscounted cost allowed per episode, of the cost `key`.
 """
 
 from __future__ import annotations
@@ -17,18 +19,10 @@ FINAL_STEPS = 100_000
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
-    """Amount by which a limit is exceeded; negative within it.
+    """Amount by which a limit is exceeded; negative within it, NaN where no episode has finished.
 
     This is J_c − d, or the column ``violation_<key>`` if there is one: an algorithm that limits
     another measure than the mean cost of an episode writes its own violation there.
-
-    Args:
-        row: Of a run's table, or its final figures, by column.
-        key: Key of the cost.
-        limit: d, undiscounted cost per episode.
-
-    Returns:
-        The violation; NaN where no episode has finished.
 
     Examples:
         >>> violation({"episode_cost": 30.0}, "cost", 25.0)
@@ -56,11 +50,6 @@ def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
     The few episodes of one epoch may keep a limit by chance. An algorithm that tracks J_c writes
     the columns ``estimate_<key>`` and ``target_<key>``. Then its estimate may not exceed its target
     either.
-
-    Args:
-        row: Of a run's table, by column.
-        key: Key of the cost.
-        limit: d, undiscounted cost per episode.
 
     Examples:
         >>> keeps({"episode_cost": 20.0}, "cost", 25.0)
@@ -92,11 +81,9 @@ def mean_row(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
 def feasible_return(
     latest: Sequence[Mapping[str, float]], limits: Mapping[str, float]
 ) -> float | None:
-    """Mean return of a run's latest epochs if their means keep every limit, else None.
+    """Mean return of a run's latest epochs, at least one, if their means keep every limit.
 
-    Args:
-        latest: The epochs' rows, at least one.
-        limits: Cost key -> d, undiscounted cost per episode.
+    Otherwise None.
 
     Examples:
         >>> rows = [{"episode_return": 4.0, "episode_cost": 29.0}]
@@ -112,11 +99,6 @@ def feasible_return(
 
 def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:
     """Whether the limit of a cost is on another measure than the mean cost of an episode.
-
-    Args:
-        table: Columns of a run's table.
-        key: Key of the cost.
-        limit: d, undiscounted cost per episode.
 
     Examples:
         >>> table = {"episode_cost": [30.0, 20.0], "violation_cost": [5.0, -5.0]}
@@ -137,10 +119,7 @@ def final_width(steps: Iterable[float]) -> int:
     """Number of epochs over which final figures, and the moving means of curves, are taken.
 
     At least ``FINAL_EPOCHS``, and enough to cover ``FINAL_STEPS`` or a fifth of the run, whichever
-    is less.
-
-    Args:
-        steps: Steps at the end of every epoch in which an episode finished.
+    is less. ``steps`` are those at the end of every epoch in which an episode finished.
 
     Examples:
         >>> [final_width(range(epoch, 1_000_001, epoch)) for epoch in (20_000, 5_000)]
@@ -165,10 +144,6 @@ def final_figures(
 
     J_r, J_c and violations of limits are means over the last :func:`final_width` epochs in which an
     episode finished; ρ_c is that of the last epoch.
-
-    Args:
-        table: Columns of the run's table.
-        cost_keys: Keys of the costs to report.
     """
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
     names = ["episode_return", *(name for name in costs if name in table)]

@@ -19,12 +19,9 @@ _LINEAR = (
 
 
 def scale_dynamics(model: mujoco.MjModel, scales: Mapping[str, float], bodies: slice) -> None:
-    """Change a compiled model in place; a factor of 1 changes no bit.
+    """Change a compiled model in place by the factors of a robot, whose body ids are `bodies`.
 
-    Args:
-        model: The compiled model.
-        scales: Key of `SCALES` -> factor; missing ones are 1.
-        bodies: Ids of the robot's bodies.
+    They are given by key of `SCALES`; a factor of 1 changes no bit.
 
     Raises:
         ConfigError: If the force of an actuator is no linear function of its gain, as for a muscle.

@@ -101,14 +101,9 @@ def locomotion_reward(
     healthy: Tensor,
     outputs: Mapping[str, Tensor],
 ) -> Tensor:
-    """Reward for forward velocity and health, minus costs of control and contact: [N].
+    """Reward for forward velocity (m/s) and health, minus costs of control and contact, [N] each.
 
-    Args:
-        config: Weights and ranges.
-        velocity_x: [N] (m/s).
-        control: [N, nu].
-        healthy: bool [N].
-        outputs: Of the physics. With a contact weight, `cfrc_ext` [N, nbody, 6] (N m, N) is read.
+    With a contact weight, the output `cfrc_ext` [N, nbody, 6] (N m, N) of the physics is read.
     """
     reward = config.forward_reward_weight * velocity_x
     if config.healthy_reward is not None:
