@@ -3,6 +3,6 @@
 The modules, from the lowest layer up: the configuration (`config`, `config_keys`, `config_values`),
 records of a world (`world`), tables of rules (`robots`, `tasks`, `costs`, `elements`, `readings`),
 names (`suite`), the compiled model (`building`, `bodies`), episodes (`layouts`, `draws`, `state`),
-pictures (`display`, `renderer`), observations (`lidar`, `observations`), and the environment
+lidars and pictures (`lidar`, `renderer`), observations (`observations`), and the environment
 (`env`).
 """

@@ -91,7 +91,7 @@ def _add_geoms(
 _NORTH_DOWN = (math.cos(math.pi / 8), math.sin(math.pi / 8), 0.0, 0.0)
 # Fixed cameras: position in the world [m].
 FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
-TRACK = "track"  # behind the robot, see `display`
+TRACK = "track"  # behind the robot, see `renderer`
 VISION = "vision"  # the robot's own, part of the robot file
 # Textures and materials of the robot file may have any other name.
 _FLOOR, _SKY = "safe_rl_floor", "safe_rl_sky"

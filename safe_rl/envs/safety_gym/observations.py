@@ -18,9 +18,9 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.display import vision_blocks
 from safe_rl.envs.safety_gym.lidar import lidar_blocks
 from safe_rl.envs.safety_gym.readings import READINGS, Reading, sensor_blocks
+from safe_rl.envs.safety_gym.renderer import vision_blocks
 from safe_rl.envs.safety_gym.world import Block, Bounds, Scene, Shapes, World
 
 
