@@ -22,7 +22,7 @@ import torch
 
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
-from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 COLUMNS = (
     *("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio"),

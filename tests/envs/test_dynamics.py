@@ -9,7 +9,7 @@ from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.velocity.runner_model import ASSETS
-from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 FILES = {name: str(path) for name, path in ROBOTS.items()} | {
     name: str(ASSETS / row.mjcf) for name, row in RUNNERS.items()

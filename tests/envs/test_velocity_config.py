@@ -9,7 +9,7 @@ import pytest
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityConfig, resolve_velocity
-from safe_rl.envs.velocity.runners import RUNNERS
+from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 OURS = {"robot", "velocity_threshold", "num_steps", *SCALES}
 THEIRS = {"xml_file", "default_camera_config", "main_body", "kwargs", "self"}

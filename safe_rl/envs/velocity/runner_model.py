@@ -18,8 +18,7 @@ from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.pictures import Camera, Marker, Pictures
 from safe_rl.envs.velocity.locomotion import FORCES, PLACES, TORSO
-from safe_rl.envs.velocity.runners import PARTS, RUNNERS
-from safe_rl.envs.velocity.velocity_config import VelocityConfig
+from safe_rl.envs.velocity.velocity_config import PARTS, RUNNERS, VelocityConfig
 
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 DISTANCE, ELEVATION = 4.0, -20.0  # of the free camera from the robot [m, degrees], as Gymnasium's

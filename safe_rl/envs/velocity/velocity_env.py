@@ -23,8 +23,7 @@ from safe_rl.envs.velocity.locomotion import (
     locomotion_reward,
 )
 from safe_rl.envs.velocity.runner_model import Observer, RobotRenderer, load_model, needed_outputs
-from safe_rl.envs.velocity.runners import RUNNERS
-from safe_rl.envs.velocity.velocity_config import VelocityConfig, resolve_velocity
+from safe_rl.envs.velocity.velocity_config import RUNNERS, VelocityConfig, resolve_velocity
 
 _PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 _OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
