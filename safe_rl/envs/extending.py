@@ -14,8 +14,8 @@ from typing import Any
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.config_values import Key, Locations, Objects, Placements, infer_key
+from safe_rl.envs.safety_gym.config import infer_key, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config_keys import Key, Locations, Objects, Placements
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY, Cost, contact_cost, hazard_cost
 from safe_rl.envs.safety_gym.elements import (
     BOX,

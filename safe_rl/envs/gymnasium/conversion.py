@@ -15,12 +15,7 @@ from torchrl.envs import GymWrapper
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, require_integer
 from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import (
-    CostReader,
-    GymnasiumEnv,
-    SixValues,
-    make_adapted,
-)
+from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean

@@ -5,15 +5,16 @@ Lengths are in metres, angles in radians, and times in environment steps unless 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.config_keys import RETIRED, Vocabulary
-from safe_rl.envs.safety_gym.config_values import Key, allowed, coerce
+from safe_rl.envs.safety_gym.config_keys import RETIRED, Key, Vocabulary
 from safe_rl.naming import did_you_mean
+from safe_rl.ranges import values_of
 
 _BUILT_IN: dict[str, Key] = {
     name: vars(Vocabulary)[name]._replace(annotation=annotation)
@@ -92,6 +93,50 @@ class SafetyGymConfig(Vocabulary):
     def to_dict(self) -> dict[str, Any]:
         """Return a flat mapping of all keys, which `from_dict` accepts."""
         return {name: getattr(self, name) for name in _keys}
+
+
+allowed = cache(values_of)
+"""Returns the allowed values of keys with an annotation."""
+
+
+def coerce(name: str, key: Key, value: Any) -> Any:
+    """Return a value as the type of its key; ConfigError if the type or range is wrong."""
+    if isinstance(key.annotation, str):
+        raise ConfigError(f"The type of key '{name}' must be a type, not {key.annotation!r}.")
+    values, plain = allowed(key.annotation), _plain(value)
+    if not values.hold(plain):
+        raise ConfigError(f"Configuration key '{name}' must be {values.words}, got {value!r}.")
+    return _cast(plain, int if values.whole else float)
+
+
+def _plain(value: Any) -> Any:
+    """Return numbers of NumPy and torch as Python's, and their arrays, lists, … as tuples."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+        return value
+    return tuple(map(_plain, value))
+
+
+def _cast(value: Any, kind: type) -> Any:
+    """Convert all numbers in a value to one type."""
+    if isinstance(value, tuple):
+        return tuple(_cast(item, kind) for item in value)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return kind(value) if is_number else value
+
+
+def infer_key(name: str, default: Any) -> Key:
+    """Return a key with the type of its default; ConfigError if the type is not clear."""
+    kind = type(default[0] if isinstance(default, tuple) and default else default)
+    if kind not in (bool, int, float, str):
+        raise ConfigError(
+            f"The type of key '{name}' does not follow from its default {default!r}: give "
+            "Key(default, annotation), such as Key(None, float | None)."
+        )
+    if isinstance(default, tuple):
+        return Key(default, tuple[float if kind is int else kind, ...])  # type: ignore[misc]
+    return Key(default, kind)
 
 
 class KeyRow(NamedTuple):

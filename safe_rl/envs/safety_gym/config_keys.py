@@ -8,19 +8,58 @@ those of the dynamics (scales), boundaries and the velocity limit.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from safe_rl.envs.safety_gym.config_values import (
-    LARGEST_SEED,
-    FreeObjects,
-    Locations,
-    Objects,
-    Pixels,
-    Placements,
-    Rectangle,
-    key,
+from safe_rl.ranges import Count, NotNegative, Positive, Range, Share, Text, Values, values_of
+
+LARGEST_SEED = 2**62  # of layouts; layout seeds are hashed as 64-bit integers
+
+Objects = Annotated[int, Range(0, 1000)]
+FreeObjects = Annotated[int, Range(0, 200)]
+"""Number of movable objects; the contacts of more would not fit into the physics' memory."""
+Pixels = tuple[Annotated[int, Range(1, 4096)], Annotated[int, Range(1, 4096)]]
+
+_FOUR = values_of(tuple[float, float, float, float])
+_RECTANGLE = "(xmin, ymin, xmax, ymax) with xmin <= xmax and ymin <= ymax"
+
+
+def _is_rectangle(value: Any) -> bool:
+    return _FOUR.hold(value) and value[0] <= value[2] and value[1] <= value[3]
+
+
+def _are_rectangles(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) > 0 and all(map(_is_rectangle, value))
+
+
+Rectangle = Annotated[tuple[float, float, float, float], Values(_is_rectangle, _RECTANGLE)]
+Placements = (
+    Annotated[
+        tuple[tuple[float, float, float, float], ...],
+        Values(_are_rectangles, f"a list of at least one {_RECTANGLE}"),
+    ]
+    | None
 )
-from safe_rl.ranges import Count, NotNegative, Positive, Range, Share, Text
+Locations = tuple[tuple[float, float], ...]
+
+
+class Key(NamedTuple):
+    """A configuration key.
+
+    Attributes:
+        default: Its default value.
+        annotation: Its type and range, such as `float | None` or `safe_rl.ranges.Positive`.
+        meaning: Its meaning, for the table of keys.
+    """
+
+    default: Any
+    annotation: Any
+    meaning: str = ""
+
+
+def key(default: Any, meaning: str) -> Any:
+    """Declare a key of the class `Vocabulary`, where its annotation gives the type and range."""
+    return Key(default, None, meaning)
+
 
 _AREAS = "rectangles where centres may be; None: anywhere within placements_extents"
 _PINNED = "fixed positions (x, y) of the first objects [m]"

@@ -14,7 +14,7 @@ from typing import Any
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.config_values import LARGEST_SEED
+from safe_rl.envs.safety_gym.config_keys import LARGEST_SEED
 from safe_rl.envs.safety_gym.robots import PATHS_OF_2019, ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.naming import did_you_mean
