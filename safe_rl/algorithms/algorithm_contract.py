@@ -47,27 +47,18 @@ class Algorithm(ABC):
         networks: Trained networks, by name. Another run can start from them.
         cost_networks: Names of the networks of the constrained costs. A run starts from another
             run's cost networks only if both have the same costs.
+        learns_from: A sentence on the data besides the run's own steps that it learns from.
+        schedule: A sentence on when the limits begin to hold; empty if they do from the start.
+        lost_on_resume: A sentence on the state that checkpoints do not have.
     """
 
     cost_keys: Sequence[str] = ()
     policy: TensorDictModuleBase
     networks: Mapping[str, nn.Module]
     cost_networks: Collection[str] = ()
-
-    @property
-    def learns_from(self) -> str:
-        """A sentence on the data besides the run's own steps that it learns from; or empty."""
-        return ""
-
-    @property
-    def schedule(self) -> str:
-        """A sentence on when the limits begin to hold; empty if they do from the start."""
-        return ""
-
-    @property
-    def lost_on_resume(self) -> str:
-        """A sentence on the state that checkpoints do not have; empty if they have all of it."""
-        return ""
+    learns_from: str = ""
+    schedule: str = ""
+    lost_on_resume: Any = ""  # a text, or a property
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:

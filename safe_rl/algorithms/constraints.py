@@ -39,6 +39,7 @@ class Constraints(Resumable):
         unit: Typical size of one cost, by which losses divide λ, [k]; see `EpisodeCosts.unit`.
         risk: Risk measure that is limited instead of the mean cost of an episode, or None.
         cost_advantage: Key of the cost advantages that the multiplier weighs.
+        schedule: A sentence on when the limits begin to hold; empty if they do from the start.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -54,6 +55,7 @@ class Constraints(Resumable):
         (tensor([5.]), tensor(1000.))
     """
 
+    schedule = ""
     # mean costs and length of episodes in the last batch in which an episode finished
     state_names = ("_finished", "_mean_length")
 
@@ -83,11 +85,6 @@ class Constraints(Resumable):
         """Limits from which violations are measured, by cost: d, or those of the risk measure."""
         held = self.limits if self.risk is None else self.risk.held_limits
         return dict(zip(self.keys, held.tolist(), strict=True))
-
-    @property
-    def schedule(self) -> str:
-        """When the limits begin to hold, in a sentence; empty if they do from the start."""
-        return ""
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Write the costs of a risk measure into a batch, before advantages are estimated."""
@@ -211,13 +208,9 @@ class TrackedConstraints(Constraints):
     ) -> None:
         super().__init__(limits, multiplier=multiplier, device=device)
         self.tracker, self.risk = tracker, risk
+        self.schedule = tracker.schedule if self.keys else ""
         self._charges: Charges | None = None
         self._row: dict[str, float] = {}
-
-    @property
-    def schedule(self) -> str:
-        """Until when costs have no effect, when the limits fall, and when they hold."""
-        return self.tracker.schedule if self.keys else ""
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Write the costs of the risk measure below ``"next"``."""

@@ -83,7 +83,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
     steps: int = 0
 
     def __post_init__(self) -> None:
-        self.cost_keys = self.constraints.keys
+        self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule
         self.cost_networks = [name for name in self.networks if name == "cost_critic"]
         self._count_steps(0)
 
@@ -155,11 +155,6 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             "The transitions in its replay buffer are not stored (memory.keep=false): learning "
             f"{resumes}, and differs from a run that was not interrupted."
         )
-
-    @property
-    def schedule(self) -> str:
-        """When the limits begin to hold."""
-        return self.constraints.schedule
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Store a batch [N, T] and take the gradient steps that are due on the replay buffer.

@@ -61,7 +61,7 @@ class OnPolicy(Algorithm, Recipe):
     critic_update: PolicyUpdate
 
     def __post_init__(self) -> None:
-        self.cost_keys = self.constraints.keys
+        self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule
         self.policy = make_behaviour(self.actor)
         self.networks = {"actor": self.actor, "critic": self.critic}
         if self.cost_critic is not None:
@@ -118,11 +118,6 @@ class OnPolicy(Algorithm, Recipe):
         """Build the policy, and the networks that it consists of."""
         actor = _build_networks(config, env, 0, device)["actor"]
         return make_behaviour(actor), {"actor": actor}
-
-    @property
-    def schedule(self) -> str:
-        """When the limits begin to hold."""
-        return self.constraints.schedule
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
         """Train on one batch.

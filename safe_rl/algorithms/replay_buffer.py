@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
@@ -274,15 +273,6 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
         raised = (errors + _SMALLEST) ** self.alpha
         self._priorities[torch.as_tensor(index).cpu()] = raised
         self._largest = max(self._largest, raised.max().item())
-
-    def dumps(self, path: Path) -> None:
-        """Write the state into a folder."""
-        Path(path).mkdir(parents=True, exist_ok=True)
-        torch.save(self.state_dict(), Path(path) / "sampler.pt")
-
-    def loads(self, path: Path) -> None:
-        """Continue from what `dumps` has written."""
-        self.load_state_dict(torch.load(Path(path) / "sampler.pt", weights_only=True))
 
     def _empty(self) -> None:
         self._priorities.zero_()

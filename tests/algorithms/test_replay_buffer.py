@@ -200,19 +200,16 @@ def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
     check_draws(memory, copy, make_batch(10, 5, rows=1))
 
 
-def test_a_buffer_of_torchrl_passes_errors_to_the_sampler_and_saves_it(tmp_path):
-    exponents = {"alpha": 0.5, "beta": 1.0}
-    first, second = (make_memory(capacity=9, prioritised=exponents)._buffer for _ in range(2))
-    first.extend(make_batch(0, 4, rows=1).reshape(-1))
-    drawn = first.sample(64)
-    first.update_tensordict_priority(drawn.set("td_error", drawn["observation"]))
-    first.dumps(tmp_path)
-    second.loads(tmp_path)
-    second.add(make_batch(4, 1, rows=1)[0, 0])
-    found = second.sampler.state_dict()["_priorities"][:5]
+def test_a_buffer_of_torchrl_passes_errors_to_the_sampler():
+    buffer = make_memory(capacity=9, prioritised={"alpha": 0.5, "beta": 1.0})._buffer
+    buffer.extend(make_batch(0, 4, rows=1).reshape(-1))
+    drawn = buffer.sample(64)
+    buffer.update_tensordict_priority(drawn.set("td_error", drawn["observation"]))
+    buffer.add(make_batch(4, 1, rows=1)[0, 0])
+    found = buffer.sampler.state_dict()["_priorities"][:5]
     assert found.numpy() == pytest.approx(np.sqrt([0, 1, 2, 3, 3]), abs=1e-3)
     with pytest.raises(ValueError, match="one dimension"):
-        second.sampler.sample(LazyTensorStorage(9, ndim=2), 1)
+        buffer.sampler.sample(LazyTensorStorage(9, ndim=2), 1)
 
 
 def test_errors_are_read_where_the_loss_writes_them():

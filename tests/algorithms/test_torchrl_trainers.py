@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -155,7 +156,7 @@ def test_the_hook_continues_from_its_state():
 def test_constraints_that_charge_steps_are_refused():
     accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
     risk = CVaR(torch.tensor([1.0]), tail=0.1, window=20, ramp_start=0, ramp_steps=0)
-    constraints = TrackedConstraints({"cost": 1.0}, tracker=None, risk=risk)
+    constraints = TrackedConstraints({"cost": 1.0}, tracker=Mock(), risk=risk)
     with pytest.raises(TypeError, match=r"plain Constraints, not TrackedConstraints.*risk="):
         ConstraintHook(constraints, accounting)
 

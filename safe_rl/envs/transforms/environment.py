@@ -33,6 +33,8 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self, base_env: ConstrainedEnv, transforms: Mapping[str, Transform], seed: int | None = None
     ) -> None:
         super().__init__(base_env, Compose(*transforms.values()))
+        self.max_episode_steps = base_env.max_episode_steps
+        self.seconds_per_step = base_env.seconds_per_step
         self._names = list(transforms)
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
@@ -53,16 +55,6 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def _ours(self) -> dict[str, ConstraintTransform]:
         named = zip(self._names, self.transform.transforms, strict=True)
         return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
-
-    @property
-    def max_episode_steps(self) -> int:
-        """The largest number of steps of an episode."""
-        return self.base_env.max_episode_steps
-
-    @property
-    def seconds_per_step(self) -> float | None:
-        """Simulated duration of a step [s]; None if the environment does not give it."""
-        return self.base_env.seconds_per_step
 
     @property
     def render(self) -> Any:
