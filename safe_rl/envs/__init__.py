@@ -6,7 +6,7 @@ Names and keys are imported at once. Modules that build environments are importe
 from typing import TYPE_CHECKING
 
 # First, because it imports MuJoCo where OpenGL is missing.
-from safe_rl.envs.opengl import OpenGLError
+from safe_rl.envs.pictures import OpenGLError
 
 # isort: split
 from safe_rl.envs.errors import ConfigError

@@ -30,7 +30,7 @@ from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import TORCHRL, TORCHRL_CLASSES, complete_foreign
-from safe_rl.envs.opengl import load_backend
+from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
 from safe_rl.targets import locate
