@@ -42,9 +42,6 @@ class Memory(Checked):
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
 
-    Raises:
-        ValueError: If an argument is outside its range, or priorities lack an exponent.
-
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
@@ -207,11 +204,6 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
     every sample, a millisecond for a million transitions. It is a subclass, because only those get
     priorities from a buffer's ``update_tensordict_priority``.
 
-    Args:
-        capacity: Largest number of transitions.
-        alpha: α, 0 for uniform draws.
-        beta: β, 0 for no weights.
-
     Raises:
         ValueError: If an exponent is negative, or, when samples are drawn, if the storage has more
             than one dimension.
@@ -250,11 +242,7 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
     extend = add
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Draw with replacement.
-
-        Returns:
-            Indices [B] and, as ``priority_weight``, the importance weights [B].
-        """
+        """Draw indices [B] with replacement, with importance weights [B] as ``priority_weight``."""
         if storage.ndim > 1:
             raise ValueError("ProportionalSampler needs a storage of one dimension: flatten steps.")
         present = self._priorities[: len(storage)]

@@ -101,11 +101,7 @@ class UpdateStepper(Resumable, OptimizationStepper):
         self.constraints = Constraints({}) if constraints is None else constraints
 
     def step(self, trainer: Trainer | None, sub_batch: TensorDictBase) -> TensorDictBase:
-        """Improve policy and critics on a batch.
-
-        Args:
-            trainer: Not used.
-            sub_batch: Data with advantages and value targets, any shape.
+        """Improve policy and critics on a batch with advantages and value targets, of any shape.
 
         Returns:
             Diagnostics of the updates, as scalars; one per constraint for vectors [k].

@@ -43,14 +43,9 @@ def compose_jobs(
 ) -> list[DictConfig]:
     """Compose the configurations that overrides describe, and check them.
 
-    Args:
-        texts: The overrides.
-        sweep: Whether overrides may have several values. Every value is checked once, together
-            with the first values of the other overrides.
-        shown: Whether the configuration is only printed; then its values are not checked.
-
-    Returns:
-        Configurations with the node ``hydra``: one, or all those that were checked for a sweep.
+    In a sweep, overrides may have several values. Every value is checked once, together with the
+    first values of the other overrides. If the configuration is only ``shown``, its values are not
+    checked. Returns configurations with the node ``hydra``: one, or all that were checked.
 
     Raises:
         CommandLineError: If a name does not exist or is not read; the message names similar ones.

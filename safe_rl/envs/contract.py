@@ -112,11 +112,7 @@ class ConstrainedEnv(EnvBase):
 
 
 def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[str, slice]:
-    """Return a layout with further components after its last column.
-
-    Args:
-        layout: Name -> columns.
-        sizes: Name -> number of columns of each further component.
+    """Return a layout with further components, of given sizes, after its last column.
 
     Examples:
         >>> add_columns({"gyro": slice(0, 3)}, {"lidar": 16})

@@ -52,11 +52,8 @@ class InOneCall:
     """Adapter by which TorchRL's losses call an ensemble as if `vmap` had made the function.
 
     It is a class because a module would become part of the loss, and a function could not be
-    pickled or follow a copy of the loss to another device.
-
-    Args:
-        network: The ensemble.
-        of_copies: Whether steps come as one copy per network; then the first copy is used.
+    pickled or follow a copy of the loss to another device. With `of_copies`, steps come as one copy
+    per network, and the first copy is used.
     """
 
     def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
@@ -161,13 +158,10 @@ class QFunctionLoss(ReplayLoss):
         action: Tensor,
         kind: Literal["own", "target", "frozen"] = "own",
     ) -> Tensor:
-        """Values [E, ..., n] of actions in the states of steps [...].
+        """Values [E, ..., n] of actions [..., A] in the states of steps [...].
 
-        Args:
-            name: Name of the attribute that holds the ensemble.
-            steps: Steps with observations.
-            action: Actions, [..., A].
-            kind: Which parameters: its own, the target network's, or its own without gradients.
+        The ensemble is the attribute `name`. Its parameters are its own, those of the target
+        network, or its own without gradients (``"frozen"``).
         """
         network: Ensemble = getattr(self, name)
         # TorchRL clears this cache whenever parameters move to another device or dtype

@@ -89,12 +89,8 @@ class WCSACLoss(SACLagrangianLoss):
     ) -> tuple[Tensor, Tensor]:
         """Targets of mean and variance from one step, [E/2, ..., k] each.
 
-        Args:
-            mean: Q_c of the steps, [E/2, ..., k]. The variance is around this mean, so differences
-                between successors are a part of the variance.
-            costs: Costs of the steps, [..., k].
-            discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
-            following: Mean and variance in the next state, [E/2, ..., k] each.
+        The variance is around `mean`, Q_c of the steps, so differences between successors are a
+        part of it. Other arguments are those of `cost_errors`; `following` are mean and variance.
         """
         target = costs + discount * following[0]
         second_moment = target.square() + discount.square() * following[1]

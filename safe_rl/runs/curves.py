@@ -49,7 +49,7 @@ def learning_curves(
     means strong ones. If the table has multipliers, a fourth panel shows them.
 
     Args:
-        table: Columns of a run's table, see :func:`safe_rl.runs.table.read_table`.
+        table: Columns of a run's table.
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
         title: Title above the panels.

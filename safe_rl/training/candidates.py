@@ -20,12 +20,8 @@ def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int
     """Epochs from a policy's update until the finished episodes are, on average, its own.
 
     A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
-    began before it. Half an episode later, the finished episodes are centred on this batch.
-
-    Args:
-        over: Number of epochs over which returns and costs are averaged.
-        length: Steps of an episode.
-        steps_per_epoch: Steps of every row in an epoch.
+    began before it. Half an episode later, the finished episodes are centred on this batch. Returns
+    and costs are averaged over a number of epochs, `over`.
 
     Examples:
         >>> epochs_until_judged(over=1, length=1000, steps_per_epoch=1000)

@@ -31,13 +31,9 @@ COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 def make_adapted(
     make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
 ) -> gymnasium.Env:
-    """Make an environment whose choices start at 0 and whose costs are floats.
+    """Make an environment whose choices start at 0 and whose costs in `info` are floats.
 
-    Args:
-        make: Makes the environment.
-        num_steps: Steps after which its episodes are truncated.
-        flatten: Whether the observation becomes one float32 vector.
-        cost_keys: Names of the costs in `info`.
+    Episodes are truncated after `num_steps`. With `flatten`, observations are float32 vectors.
     """
     env = make()
     seen, actions = env.observation_space, env.action_space
@@ -107,11 +103,6 @@ class CostReader(BaseInfoDictReader):
 
     Some environments report a cost only when it occurs. If no `info` of the first `patience` steps
     contains a cost, there is one warning.
-
-    Args:
-        cost_keys: Names in `info`.
-        num_envs: N.
-        patience: Steps until the warning.
     """
 
     def __init__(self, cost_keys: Sequence[str], num_envs: int, patience: int) -> None:

@@ -132,9 +132,7 @@ class Physics(ABC):
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
         """Raise an error if `wrong` (bool) is True anywhere, on a device possibly in a later call.
 
-        Args:
-            wrong: Where something is wrong.
-            error: Makes the error, and may read tensors.
+        `error` makes the error, and may read tensors.
         """
         if wrong.any():
             raise error()
