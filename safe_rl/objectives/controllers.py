@@ -20,11 +20,7 @@ class PIMultiplier(Multiplier):
     the bound on Δ, a cost of six times the limit would raise the integral several times as fast as
     a cost of 0 lowers it.
 
-    For the controller, a policy behaves like an integrator: per update, J_c changes by about
-    β (λ* − λ) times the limit, where λ* is the multiplier that keeps J_c constant. PI control of an
-    integrator has the natural frequency √(β K_I) and the damping ratio ½ K_P √(β / K_I); an
-    integral alone has no damping. In our runs β is about ¼ or less. For β = ¼, K_P = 4 and
-    K_I = 0.4 give a period of 20 updates and a damping ratio of 1.6; for β = 0.1 the ratio is 1.
+    `docs/algorithms/holding_the_limit.md` explains how gains set the period and the damping.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.

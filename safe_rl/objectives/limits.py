@@ -1,16 +1,9 @@
 """The distance of each cost from its current target, for multipliers and CPO steps.
 
-Four decisions lead from the costs of a batch to the violation that an update sees:
-
-- **how J_c is estimated** from a batch (`safe_rl.objectives.episode_costs`);
-- **a descent**: costs have no effect until the policy has found its goal. Then the limit falls from
-  the policy's current cost to its final value. If costs count from the start, the goal is not
-  found. If they count too late, the policy has learned to ignore costs, and reduces them slowly;
-- **a margin**: the target is z standard errors of a batch's J_c below the limit. Then the estimate
-  of one batch is above the limit with a probability of about Φ(−z);
-- **trust**: the surrogate of a step predicts a change of J_c, but only a share of it is observed.
-  For steps that rely on predictions (CPO), this share is measured, and violations are divided by
-  it. Violations that remain after an update are summed and added, as an integral.
+Four decisions lead from the costs of a batch to the violation that an update sees: how J_c is
+estimated (`safe_rl.objectives.episode_costs`), how the limit falls to its final value, how far
+below it the target is, and how much of a predicted change of J_c is expected to occur. The reasons
+are in `docs/algorithms/holding_the_limit.md`.
 """
 
 from __future__ import annotations
