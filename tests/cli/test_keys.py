@@ -144,7 +144,6 @@ def test_no_value_ends_in_a_traceback():
         ("seed", True, "seed=true"),
         ("model.hidden_sizes", 64, "model.hidden_sizes=64: it must be a list"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be a number from 0 to 1 (discount"),
-        ("policy_update.max_kl", -1, "policy_update.max_kl=-1: it must be a number above 0"),
         ("policy_update.adapt_rate", 3, "policy_update.adapt_rate=3: it must be a part"),
         ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be a number above 1"),
         ("loss.clip_epsilon", math.nan, "loss.clip_epsilon=nan: it must be"),

@@ -47,7 +47,6 @@ def test_names_stay_as_they_are_written(name):
         ("episodes", "'episodes' is not an option: they are written key=value"),
         ("episodes=many", "'many'.*option 'episodes'"),
         ("video=maybe", "'maybe'.*option 'video'"),
-        ("episodes=nan", "'nan'.*option 'episodes'"),
         ("episodes=[1", "cannot be read"),
         ("cost_limits={cost: low}", "'low'.*option 'cost_limits.cost'"),
     ],
@@ -62,14 +61,11 @@ def test_errors_say_what_to_write(argument, message):
     [
         ("episodes=0", "episodes=0: .* from 1 to 100,000,000"),
         ("num_envs=1000000000", "num_envs=1000000000: .* to 100,000"),
-        ("num_threads=1000000", "num_threads=1000000: .* to 1,024"),
-        ("seed=-1", "seed=-1: .* from 0"),
         ("name=a/b", "name=a/b: .*without /"),
         ("camera=track", r"camera=track: it is the video's: add video=true\."),
         ("device=meta", "device=meta: it must be cpu; or cuda"),
         ("cvar_alpha=nan", "nan"),
         ("cost_limits={cost: -1}", "cost_limits=.*-1.*each a number from 0"),
-        ("cost_limits={cost: nan}", "cost_limits=.*nan.*each a number from 0"),
     ],
 )
 def test_options_are_checked_before_anything_is_done(tmp_path, argument, message):

@@ -55,19 +55,15 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
 @pytest.mark.parametrize(
     ("key", "role"),
     [
-        ("policy_update.max_kl", Role.LEARNING),
         ("policy_update.adapt_rate.factor", Role.LEARNING),
         ("policy_update._target_", Role.EXPERIMENT),
-        ("policy_update.optimizer.lr", Role.EXPERIMENT),
         ("loss.gamma", Role.LEARNING),
         ("loss.alpha_init", Role.EXPERIMENT),
-        ("policy_update.compile", Role.MACHINE),
         ("logger._target_", Role.MACHINE),
         ("note", Role.MANNER),
         ("collector._target_", Role.MANNER),
         ("hydra.verbose", Role.MACHINE),
         ("hydra.run.dir", Role.MANNER),
-        ("env.hazards_num", Role.EXPERIMENT),
         ("mine", Role.EXPERIMENT),
     ],
 )

@@ -83,7 +83,6 @@ def test_every_environment_with_scores_is_itself(name):
         {**NODE, "name": ["PointGoal1"]},
         {key: value for key, value in NODE.items() if key != "name"},
         {**NODE, "hazards_num": 3},
-        {**NODE, "hazards_num": "${oc.env:NUMBER}"},
         {**NODE, "_target_": "some.other.family"},
         {**NODE, "id": "Pendulum-v1"},
         {"name": "PointGoal1"},
