@@ -207,15 +207,6 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
     Raises:
         ValueError: If an exponent is negative, or, when samples are drawn, if the storage has more
             than one dimension.
-
-    Examples:
-        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
-        >>> sampler = ProportionalSampler(10, alpha=1.0, beta=1.0)
-        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=1000)
-        >>> _ = buffer.extend(torch.arange(4))
-        >>> buffer.update_priority(torch.arange(4), torch.tensor([0.0, 1.0, 0.0, 3.0]))
-        >>> sorted(set(buffer.sample().tolist()))
-        [1, 3]
     """
 
     state_names = ("_priorities", "_largest")

@@ -86,12 +86,9 @@ class Session:
 
     @classmethod
     def begin(cls, config: DictConfig, folder: Path | None = None, **options: Any) -> Session:
-        """Begin a new run.
+        """Begin a new run, in the folder that its configuration names unless one is given.
 
-        Args:
-            config: As `compose_jobs` returns it; its node ``hydra`` is removed.
-            folder: Its folder; None: the one that the configuration names.
-            options: Other arguments of the class.
+        The configuration is as `compose_jobs` returns it; its node ``hydra`` is removed.
         """
         if folder is None:
             with resolving(config):

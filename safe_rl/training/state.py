@@ -77,14 +77,9 @@ class WorldSnapshot:
     def stagger(self, max_steps: int, multiple: int = 1) -> bool:
         """Start instance i of N at step i · max_steps / N of its first episode.
 
-        Then the episodes of different instances end at different times.
-
-        Args:
-            max_steps: Steps of an episode.
-            multiple: Environment steps per decision; all instances start at a multiple of it.
-
-        Returns:
-            Whether this was possible: the environment's state must have a ``step_count``.
+        Then the episodes of different instances end at different times. All instances start at a
+        multiple of the environment steps per decision. Returns whether this was possible: the
+        environment's state must have a ``step_count``.
         """
         state = self._env.get_state()
         steps = state.get("step_count", None)
