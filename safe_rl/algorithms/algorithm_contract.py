@@ -155,6 +155,18 @@ class SequentialUpdates(PolicyUpdate):
         first: The first update; its diagnostics keep their names.
         then: The other updates, in order. Their diagnostics are called ``<name>_…``.
             ``cost_surrogate`` is that of the last update that reports one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> class Fixed(PolicyUpdate):
+        ...     def __init__(self, kl):
+        ...         self.kl = torch.tensor(kl)
+        ...     def __call__(self, batch, cost_violation, episode_length):
+        ...         return {"kl": self.kl}
+        >>> update = SequentialUpdates(Fixed(0.01), {"projection": Fixed(0.02)})
+        >>> update(TensorDict(), torch.zeros(1), torch.ones(()))
+        {'kl': tensor(0.0100), 'projection_kl': tensor(0.0200)}
     """
 
     state_names = ("first", "then")

@@ -170,6 +170,21 @@ class PCPOStep(CPOStep):
         loss: Loss with surrogates of the costs, as in `CPOStep`.
         projection: Distance that the projection minimises: ``"kl"`` or ``"l2"``.
         settings: Settings of a `CPOStep` and of every trust-region step, see `TRPOStep`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> settings = {"projection": "kl", "rescale_violation": True, "damping": 0.1, **search}
+        >>> step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
+        >>> metrics = step(batch, torch.tensor([-1e6]), torch.tensor(50.0))
+        >>> metrics["nu"]  # far inside, TRPO's step
+        tensor([0.])
     """
 
     def __init__(self, loss: Loss, *, projection: Projection, **settings: Any) -> None:

@@ -59,6 +59,24 @@ class CTRPOStep(TRPOStep):
         beta: Weight β of the barrier, per unit of an episode's undiscounted cost, for every cost.
         hysteresis: Share of d at which a recovery ends; 1 ends it at the limit.
         settings: Settings of every trust-region step, see `TRPOStep`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
+        >>> region = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10}
+        >>> search = {"backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> barrier = {"beta": 0.1, "hysteresis": 0.8}
+        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
+        >>> step = CTRPOStep(loss, {"cost": 25.0}, **barrier, **region, **search)
+        >>> length = torch.tensor(1000.0)
+        >>> violations = [torch.tensor([violation]) for violation in (1, -1, -6)]
+        >>> [step(batch, violation, length)["recovers"].item() for violation in violations]
+        [1.0, 1.0, 0.0]
     """
 
     state_names = ("recovering",)
@@ -124,6 +142,20 @@ class CRPOStep(TRPOStep):
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         tolerance: Tolerated violation η, undiscounted cost per episode.
         settings: Settings of every trust-region step, see `TRPOStep`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import CPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 2)
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> loss = CPOLoss(actor, entropy_coeff=0.0)
+        >>> step = CRPOStep(loss, tolerance=2.0, target_kl=0.01, damping=0.1, **search)
+        >>> step(batch, cost_violation=torch.tensor([1.0, 5.0]))["reduces"]
+        tensor([0., 1.])
     """
 
     def __init__(self, loss: Loss, *, tolerance: NotNegative, **settings: Any) -> None:

@@ -40,6 +40,18 @@ class ReplayUpdate(Checked):
         ValueError: If no parameter's name begins with a key of ``rates``, or the loss has target
             networks and ``tau`` is None.
         FloatingPointError: By the call, if a loss is not finite, before the step on this loss.
+
+    Examples:
+        >>> from functools import partial
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import SACLoss
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> loss = SACLoss(actor, q, gamma=0.99, alpha_init=0.1, target_entropy=-2.0)
+        >>> adam = partial(torch.optim.Adam, lr=1e-3)
+        >>> update = ReplayUpdate(loss, optimizer=adam, updates_per_step=1.0, tau=0.005)
+        >>> update.due(10), update.due(10)
+        (10, 10)
     """
 
     def __init__(

@@ -87,6 +87,20 @@ class UpdateStepper(Resumable, OptimizationStepper):
         policy_update: A `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
         critic_update: Update that fits the critics afterwards, or None.
         constraints: Constraints of a constrained step, updated by a `ConstraintHook`; or None.
+
+    Examples:
+        >>> from safe_rl.algorithms import TRPOStep
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import TRPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"] = torch.randn(8, 1)
+        >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
+        >>> loss = TRPOLoss(actor, entropy_coeff=0.0)
+        >>> update = TRPOStep(loss, target_kl=0.01, damping=0.1, **search)
+        >>> bool(UpdateStepper(update).step(None, batch)["kl"] <= 0.01)
+        True
     """
 
     state_names = ("policy_update", "critic_update")

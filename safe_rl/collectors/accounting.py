@@ -31,6 +31,17 @@ class EpisodeStatistics:
         reward_rate: All reward so far divided by all steps so far, a scalar tensor.
         open_costs: Cost key -> cost that the unfinished episode of every row had before the batch,
             shape [N]; NaN for episodes that are left out of the statistics.
+
+    Examples:
+        >>> import torch
+        >>> statistics = EpisodeStatistics(
+        ...     returns=torch.tensor([1.0, 3.0]),
+        ...     costs={"cost": torch.tensor([20.0, 40.0])},
+        ...     lengths=torch.tensor([1000.0, 1000.0]),
+        ...     cost_rates={"cost": torch.tensor(0.03)},
+        ... )
+        >>> statistics.mean_costs(["cost"])
+        tensor([30.])
     """
 
     returns: Tensor

@@ -111,6 +111,22 @@ class StepRecorder:
     Args:
         recording: Recording that gets batches 0, 1, 2, …; those that it has already are removed.
         steps: Number of steps per batch.
+
+    Examples:
+        >>> done = torch.zeros(4, 1, dtype=torch.bool)
+        >>> following = {"observation": torch.ones(4, 2), "reward": torch.ones(4, 1)}
+        >>> following |= {"done": done, "terminated": done, "truncated": done}
+        >>> step = TensorDict(
+        ...     observation=torch.zeros(4, 2), action=torch.zeros(4, 1), next=following,
+        ...     batch_size=[4],
+        ... )
+        >>> folder = getfixture("tmp_path")
+        >>> recorder = StepRecorder(Recording(folder, []), steps=2)
+        >>> for _ in range(3):
+        ...     recorder(step)
+        >>> recorder.flush()
+        >>> read_recording(folder).shape
+        torch.Size([4, 3])
     """
 
     def __init__(self, recording: Recording, steps: int = 500) -> None:

@@ -87,6 +87,17 @@ class ExploringPolicy(TensorDictModuleBase):
     Attributes:
         is_random: Whether actions are uniformly random. It is a buffer, so the workers of a
             collector receive it with the weights.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_squashed_actor
+        >>> bounds = -torch.ones(2), torch.ones(2)
+        >>> policy = ExploringPolicy(make_squashed_actor(3, *bounds, hidden_sizes=[8]), *bounds)
+        >>> policy.is_random.fill_(True)
+        tensor(True)
+        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
+        torch.Size([5, 2])
     """
 
     low: Tensor

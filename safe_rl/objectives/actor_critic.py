@@ -23,6 +23,16 @@ class ActorCriticLoss(LossModule):
         policy_loss: A `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
         critic_loss: Loss of the reward critic and, with constraints, of the cost critic.
         critic_coeff: Factor by which the critics' losses are multiplied.
+
+    Examples:
+        >>> from safe_rl.models import make_actor, make_critic
+        >>> from safe_rl.objectives import PPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> critic = make_critic(3, hidden_sizes=[8])
+        >>> policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=1.0)
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_objective', 'loss_entropy', 'loss_critic']
     """
 
     def __init__(

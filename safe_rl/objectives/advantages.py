@@ -215,6 +215,12 @@ class CostGAE(VectorGAE):
         cost_keys: Keys of the costs under ``"next"``, in the order of the k outputs.
         value_network: Cost critic, which writes ``cost_value`` [..., T, k]; None: see `VectorGAE`.
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
+
+    Examples:
+        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
+        >>> estimator = CostGAE(["cost_hazards", "cost_vases_contact"], None, **settings)
+        >>> estimator.out_keys
+        ['cost_advantage', 'cost_value_target']
     """
 
     @dataclass

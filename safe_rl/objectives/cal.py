@@ -58,6 +58,23 @@ class CALLoss(SACLagrangianLoss):
 
     Attributes:
         discounted_limit: d', [k]; infinite, so that λ̂ is 0, until `calibrate` sets it.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> cost_q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=4, out_key="cost_value")
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> settings = {"convexity": 10.0, "ratio_memory": 0.9, "largest_ratio": 2.0}
+        >>> settings |= {"gamma": 0.99, "alpha_init": 0.1, "target_entropy": -2.0}
+        >>> loss = CALLoss(
+        ...     actor, q, cost_q, multiplier=multiplier, cost_keys=["cost"], **settings
+        ... )
+        >>> _ = loss.discounted_limit.fill_(2.5)
+        >>> values = torch.full((4, 6, 1), 2.7)  # of four networks for six actions
+        >>> loss.cost_weights(values)  # 1 + 10 (2.7 - 2.5)
+        tensor([3.0000])
     """
 
     discounted_limit: Tensor

@@ -128,6 +128,20 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
 
     `CostCritics` explains r and u. Arguments are those of `CostCritics` and `TD3Loss`.
+
+    Examples:
+        >>> from safe_rl.models import QEnsemble, make_bounded_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> from torchrl.data import Bounded
+        >>> actor = make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> cost_q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=1, out_key="cost_value")
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> settings = {"gamma": 0.99, "policy_noise": 0.2, "noise_clip": 0.5}
+        >>> settings |= {"action_spec": Bounded(-1, 1, [2]), "cost_keys": ["cost"]}
+        >>> loss = TD3LagrangianLoss(actor, q, cost_q, multiplier=multiplier, **settings)
+        >>> loss.out_keys[-2:]
+        ['loss_cost_qvalue', 'cost_qvalue']
     """
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:

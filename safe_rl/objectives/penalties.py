@@ -133,6 +133,16 @@ class IPOLoss(PenaltyLoss):
         max_weight: Largest weight of a cost, which it has at the limit and beyond, in units of the
             standardised reward advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
+
+    Examples:
+        >>> from safe_rl.algorithms import Constraints
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
+        >>> constraints = Constraints({"cost": 25.0})
+        >>> loss = IPOLoss(actor, constraints, kappa=0.01, max_weight=10.0, **settings)
+        >>> "loss_barrier" in loss.out_keys
+        True
     """
 
     extra_out_keys = ("loss_barrier", "clip_fraction", "cost_surrogate")

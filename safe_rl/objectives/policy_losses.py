@@ -139,6 +139,15 @@ class RCPOLoss(WeighsCosts, PPOLoss):
     − λc would lag behind changes of λ. The objective is clipped as a whole, min(ρÂ, clip(ρ)Â). The
     multiplier should change slowly (the third time scale of the article). Arguments are a
     multiplier, with one λ per column of ``cost_advantage``, and those of `PPOLoss`.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import ProjectedMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.001, highest=None)
+        >>> loss = RCPOLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> "cost_advantage" in loss.in_keys
+        True
     """
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
@@ -153,6 +162,12 @@ class TRPOLoss(SurrogateLoss):
 
     A `safe_rl.algorithms.TRPOStep` minimises it within a trust region; with an optimiser it is the
     plain importance-weighted policy gradient. Arguments are those of `SurrogateLoss`.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> TRPOLoss(actor, entropy_coeff=0.0).out_keys
+        ['loss_objective', 'loss_entropy', 'kl', 'entropy', 'ESS']
     """
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
@@ -165,6 +180,14 @@ class TRPOLagrangianLoss(WeighsCosts, TRPOLoss):
     """`TRPOLoss` on the Lagrangian (L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ), for k constraints.
 
     Arguments are a multiplier, one λ per column of ``cost_advantage``, and those of `TRPOLoss`.
+
+    Examples:
+        >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> "cost_advantage" in TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0).in_keys
+        True
     """
 
 
@@ -174,6 +197,12 @@ class CPOLoss(SurrogateLoss):
     Both have gradients. The cost surrogates are constraints, not losses: a
     `safe_rl.algorithms.CPOStep` keeps them within their limits, and needs the mean over the samples
     (``reduction``). Arguments are those of `SurrogateLoss`.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> CPOLoss(actor, entropy_coeff=0.0).out_keys
+        ['loss_objective', 'loss_entropy', 'cost_surrogate', 'kl', 'entropy', 'ESS']
     """
 
     extra_out_keys = ("cost_surrogate",)

@@ -32,6 +32,15 @@ class FOCOPSLoss(WeighsCosts):
         temperature: Multiplier β of the trust region, named λ in the article.
         max_state_kl: KL divergence δ beyond which a state is ignored.
         settings: Those of every policy loss, see `SurrogateLoss`.
+
+    Examples:
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import ProjectedMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)
+        >>> settings = {"max_state_kl": 0.02, "entropy_coeff": 0.0}
+        >>> FOCOPSLoss(actor, multiplier, temperature=1.5, **settings).out_keys
+        ['loss_objective', 'loss_entropy', 'trusted_fraction', 'kl', 'entropy', 'ESS']
     """
 
     extra_out_keys = ("trusted_fraction",)

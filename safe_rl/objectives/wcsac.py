@@ -54,6 +54,22 @@ class WCSACLoss(SACLagrangianLoss):
 
     Raises:
         ValueError: If α is outside (0, 1], or the number of networks is odd.
+
+    Examples:
+        >>> import torch
+        >>> from safe_rl.models import QEnsemble, make_squashed_actor
+        >>> from safe_rl.objectives import LagrangeMultiplier
+        >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
+        >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
+        >>> cost_q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2, out_key="cost_value")
+        >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
+        >>> settings = {"tail": 0.5, "gamma": 0.99, "alpha_init": 0.1, "target_entropy": -2.0}
+        >>> loss = WCSACLoss(
+        ...     actor, q, cost_q, multiplier=multiplier, cost_keys=["cost"], **settings
+        ... )
+        >>> mean, variance = torch.tensor([[3.0]]), torch.tensor([[3.0]])
+        >>> loss.charged(torch.stack([mean, variance]))  # 3 + 0.7979 √softplus(3)
+        tensor([[4.3931]])
     """
 
     risk_measure = CVaR
