@@ -6,7 +6,7 @@ and `values_of` turns an annotation into a check and a description for messages.
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce, wraps
@@ -60,10 +60,9 @@ class Range:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; True and False are not."""
+    """Whether a value is a number that a float can hold, and finite; True and False are not."""
     is_real = isinstance(value, int | float) and not isinstance(value, bool)
-    # a whole number may be too large to be a float
-    return is_real and (isinstance(value, int) or math.isfinite(value))
+    return is_real and abs(value) <= sys.float_info.max
 
 
 def is_text(value: Any) -> bool:

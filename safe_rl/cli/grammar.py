@@ -149,9 +149,9 @@ def parse_options(arguments: Sequence[str], schema: type[Schema]) -> Schema:
         OmegaConf.update(read, key, written if is_plain else parse(argument).value())
     try:
         return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(schema), read))  # type: ignore[return-value]
-    except OmegaConfBaseException as error:
-        line = str(error).splitlines()[0]
-        raise CommandLineError(f"{line} (option '{error.full_key}')") from error
+    except (OmegaConfBaseException, OverflowError) as error:
+        line, _, place = str(error).partition("\n    full_key: ")
+        raise CommandLineError(f"{line} (option '{place.partition(chr(10))[0]}')") from error
 
 
 def take_options(given: Mapping[str, Any], schema: type[Schema]) -> Schema:

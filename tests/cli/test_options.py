@@ -49,6 +49,7 @@ def test_names_stay_as_they_are_written(name):
         ("video=maybe", "'maybe'.*option 'video'"),
         ("episodes=[1", "cannot be read"),
         ("cost_limits={cost: low}", "'low'.*option 'cost_limits.cost'"),
+        (f"cost_limits={{cost: {10**400}}}", "too large.*option 'cost_limits.cost'"),
     ],
 )
 def test_errors_say_what_to_write(argument, message):
