@@ -56,7 +56,7 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     value is NaN, infinite or above ``highest``.
 
     Raises:
-        ValueError: If ``highest`` is not finite.
+        ValueError: If ``highest`` is not finite, and all values are.
 
     Examples:
         >>> round(betting_bound([20.0, 22.0, 24.0, 26.0] * 50, level=0.95, highest=50.0), 2)
@@ -64,11 +64,11 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
         >>> round(betting_bound([0.0] * 59, level=0.95, highest=100.0), 1)
         6.1
     """
-    if not math.isfinite(highest):
-        raise ValueError(f"The highest value must be finite, not {highest}.")
     values = np.asarray(values, dtype=float)
     if not np.isfinite(values).all() or (values > highest * (1 + 1e-6)).any():
         return math.inf
+    if not math.isfinite(highest):
+        raise ValueError(f"The highest value must be finite, not {highest}.")
     if not values.size or highest <= 0:
         return float(highest)
     low, high = float(values.mean()), float(highest)

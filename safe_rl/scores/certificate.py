@@ -49,7 +49,9 @@ class Statement:
             )
             return float(test.proportion_ci(level, method="exact").high)
         if kind == "student":
-            return min(student_bound(self.values, level), self.highest)
+            # a cost that is infinite or NaN has no bound
+            most = float(np.max(self.values, initial=self.highest))
+            return min(student_bound(self.values, level), most)
         return betting_bound(self.values, level, self.highest)
 
     def is_shown(self, level: float) -> bool:

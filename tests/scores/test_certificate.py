@@ -161,6 +161,11 @@ def test_a_cost_that_is_no_number_is_never_below_its_limit(odd):
     bounds = claim.bounds({"cost": costs}, tests=1)
     assert bounds["mean_cost"][0] == np.inf
     assert bounds["over_limit_cost"][0] == betting_bound(np.arange(401) == 0, 0.95, 1.0)
+    # even if no cost can be above the limit, or only episodes of the ranking have such a cost
+    student = replace(CLAIM, bound="student", highest={"cost": 20.0})
+    assert student.bounds({"cost": costs}, tests=1)["mean_cost"][0] == np.inf
+    cvar = replace(CLAIM, tail=0.1).with_thresholds({"cost": [0.0, odd]})
+    assert first_certified([0], lambda _: batches(costs[1:]), [cvar], 1, 400).certified is None
 
 
 def test_policies_with_costs_or_returns_that_are_no_numbers_are_tested_last():

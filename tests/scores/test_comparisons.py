@@ -87,7 +87,7 @@ def test_the_interval_of_a_share_is_wilsons():
     half = z / (total + z**2) * math.sqrt(over * (total - over) / total + z**2 / 4)
     estimate = share_over(values, 25.0)
     assert estimate == pytest.approx((0.2, centre - half, centre + half), rel=1e-5)
-    assert share_over([25.0, 25.0], 25.0).value == 0.0
+    assert [share_over([25.0, cost], 25.0).value for cost in (25.0, math.nan)] == [0.0, 0.5]
 
 
 # five runs on three environments
