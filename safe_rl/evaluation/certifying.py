@@ -103,6 +103,9 @@ def certify(
 
     Returns:
         The certificate; None if the run has no limits or no checkpoints.
+
+    Raises:
+        ValueError: If the cap is not above every limit.
     """
     config = load_config(directory)
     folder = RunFolder(directory)
@@ -115,16 +118,16 @@ def certify(
     device = config.device if torch.cuda.is_available() else "cpu"
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
-    highest: dict[str, float] = {}
+    asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
+    settings = {name: getattr(options, name) for name in asked}
+    highest: dict[str, float] = {}  # as of the first episodes
+    claim = Claim(limits, highest=highest, **settings)
     groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
     first = [
         episodes
         for group in groups
         for episodes in next(_run(group, _RANKING, options.ranking, highest, progress))
     ]
-    asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
-    settings = {name: getattr(options, name) for name in asked}
-    claim = Claim(limits, highest=highest, **settings)
     costs = [_costs(episodes) for episodes in first]
     claims = [claim.with_thresholds(found) for found in costs]
     returns: dict[int, list[torch.Tensor]] = {}

@@ -84,15 +84,18 @@ class Claim:
         highest: Cost key -> the highest possible cost of an episode; infinite if not given.
         bound: Kind of the bounds of means: "betting", which always holds, or "student", for costs
             without rare high ones.
-        cap: Costs of episodes count only up to this value, and at most a share ``most_beyond`` of
-            them may cost more. None: no cap, or, for the betting bound if the highest cost is
-            infinite, a cap of ten times the limit (of 10 for a limit of 0).
+        cap: Costs of episodes count only up to this value, above all limits, and at most a share
+            ``most_beyond`` of them may cost more. None: no cap, or, for the betting bound if the
+            highest cost is infinite, a cap of ten times the limit (of 10 for a limit of 0).
         most_beyond: Largest share of episodes that may cost more than a cap.
         tail: Share α of the episodes with the highest costs, whose mean is limited (CVaR); 1: the
             mean of all episodes is limited.
         thresholds: With a tail below 1: cost key -> ν. The CVaR is at most ν + E[(C − ν)₊] / α for
             every ν that is chosen before the test, and equal to it if a share α of the episodes
             costs more than ν.
+
+    Raises:
+        ValueError: If the cap is not above every limit: all policies would keep such a limit.
 
     Examples:
         >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
@@ -109,6 +112,15 @@ class Claim:
     most_beyond: float = 0.01
     tail: float = 1.0
     thresholds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for key, limit in self.limits.items():
+            if self.cap is not None and self.cap <= limit:
+                raise ValueError(
+                    f"cap={self.cap:g}: it must be above every limit, and that of '{key}' is "
+                    f"{limit:g}. No cost counts for more than the cap, so every policy would keep "
+                    "this limit."
+                )
 
     def with_thresholds(self, costs: Costs) -> Claim:
         """The claim with ν set to the value at risk of episodes that are in no test."""

@@ -112,6 +112,8 @@ def test_costs_without_a_highest_count_up_to_a_cap_and_few_may_cost_more():
     lower = replace(CLAIM, cap=50.0).bounds({"cost": costs}, tests=1)
     assert list(lower) == ["beyond_50_cost", "mean_cost"]
     assert list(replace(CLAIM, cap=300.0).bounds({"cost": costs}, tests=1)) == ["mean_cost"]
+    with pytest.raises(ValueError, match="cap=25: it must be above every limit, and that of"):
+        replace(CLAIM, cap=25.0)  # which the mean of capped costs could not exceed
     many = np.r_[np.full(780, 10.0), np.full(20, 260.0)]
     assert list(Claim({"cost": 25.0}).shortfalls({"cost": many}, tests=1)) == ["beyond_250_cost"]
 
