@@ -24,7 +24,8 @@ def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, 
 
 
 @pytest.mark.parametrize(
-    ("overrides", "tail"), [(["algo=cpo"], 1.0), (["risk=cvar"], 0.1), (["algo=wcsac"], 0.5)]
+    ("overrides", "tail"),
+    [([], 1.0), (["risk=cvar"], 0.1), (["algo=wcsac"], 0.5), (["algo=wcsac", "risk=mean"], 1.0)],
 )
 def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail):
     assert certificate_options(compose_config(*overrides)).tail == tail
