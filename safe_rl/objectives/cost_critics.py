@@ -52,7 +52,7 @@ class CostCritics(QFunctionLoss):
 
     Attributes:
         cost_unit: u, the typical size of one cost (`EpisodeCosts.unit`), [k]; 1 before `calibrate`.
-        reward_unit: r, the standard deviation of the rewards of single steps; 1 before `measure`.
+        reward_unit: r, the standard deviation of the rewards of single steps; 1 if they do not differ.
     """
 
     _in_keys: list[NestedKey]
@@ -127,8 +127,9 @@ class CostCritics(QFunctionLoss):
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))
         number, total, squares = self.reward_sums
-        variance = (squares / number - (total / number).square()).clamp_min(0)
-        self.reward_unit.copy_(torch.where(variance > 0, variance.sqrt(), 1.0))
+        variance = squares / number - (total / number).square()
+        varies = variance > 1e-12 * squares / number  # more than by rounding errors
+        self.reward_unit.copy_(torch.where(varies, variance.sqrt(), 1.0))
 
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""
