@@ -209,7 +209,7 @@ def test_folders_of_ones_own_are_searched_too(own_conf, flag):
         "env=Nearbye": "Did you mean 'Nearby'",
         "mine.tial=1": "Did you mean 'mine.tail'",
         "+frmaes=3": "Did you mean 'frames'",
-        "mine.tail=abc": "lagrangian.init=abc",
+        "mine.tail=abc": "mine.tail=abc: it must be a number",
     }.items():
         choice = [] if wrong.startswith("algo") else ["algo=mine"]
         with pytest.raises((CommandLineError, SettingError), match=meant):
