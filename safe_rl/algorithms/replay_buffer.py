@@ -68,7 +68,7 @@ class Memory(Checked):
         device: torch.device | str | None = None,
     ) -> None:
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
-        self._in_keys, self._device = list(in_keys), torch.device(device or "cpu")
+        self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         self._is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity, device=self._device),
@@ -81,7 +81,6 @@ class Memory(Checked):
             self._multi_step = MultiStepTransform(
                 n_steps, reward_gamma, reward_keys=list(reward_keys), done_keys=[]
             )
-            self._in_keys.append("steps_to_next_obs")
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -94,7 +93,8 @@ class Memory(Checked):
     def _add(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
             return
-        pieces = [piece.select(*self._in_keys) for piece in pieces]
+        spanned = [] if self._multi_step is None else ["steps_to_next_obs"]
+        pieces = [piece.select(*self.in_keys, *spanned) for piece in pieces]
         steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
         self._buffer.extend(steps.reshape(-1))
 
@@ -116,11 +116,6 @@ class Memory(Checked):
         beyond = waiting[..., -1:].expand(*waiting.shape[:-1], transform.n_steps)
         self._add([transform.inv(beyond)])
         transform._buffer = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries of a step that are stored."""
-        return [key for key in self._in_keys if key != "steps_to_next_obs"]
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
         """Draw a number of minibatches.

@@ -121,7 +121,7 @@ class ReplayUpdate(Checked):
             buffer.learned(minibatch, self.loss.priority_key)
             with torch.no_grad():
                 values = dict(losses.items())
-                sums += torch.stack([_mean(values.get(name, nothing)) for name in names])
+                sums += torch.stack([values.get(name, nothing).mean() for name in names])
             counts = {name: count + (name in values) for name, count in counts.items()}
         means = sums.cpu() / torch.tensor([float(count) for count in counts.values()])
         return dict(zip(names, means, strict=True)) | {"num_updates": torch.tensor(float(number))}
@@ -165,10 +165,6 @@ class ReplayUpdate(Checked):
             if name in stored or name != "_target_entropy":
                 tensor.copy_(stored[name])
         self._counts.update(state_dict["counts"])
-
-
-def _mean(value: Tensor) -> Tensor:
-    return value.mean() if value.ndim else value
 
 
 def _groups(loss: ReplayLoss, rates: Mapping[str, float]) -> list[dict[str, Any]]:

@@ -70,9 +70,8 @@ def certificate_options(
         options[name] = value
     if not options["episodes"]:  # training was to end without a certificate
         options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
-    risk = config.get("risk") or {}
-    # risk=mean leaves an algorithm's own numbers, such as the tail of WCSAC's critics
-    risk = risk if risk.get("_target_") else {}
+    # with risk=mean the section may still have numbers, such as the tail of WCSAC's critics
+    risk = config.risk if OmegaConf.select(config, "risk._target_") else {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
     return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))
 

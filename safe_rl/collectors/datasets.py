@@ -101,8 +101,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
     try:
         with h5py.File(path, "r") as file:
-            numbers = sorted(int(n[8:]) for n in file if fullmatch(r"episode_\d+", n))
-            names = [f"episode_{number}" for number in numbers]
+            episodes = (name for name in file if fullmatch(r"episode_\d+", name))
+            names = sorted(episodes, key=lambda name: int(name[8:]))
             arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
     except OSError as error:
         raise ValueError(f"{path} cannot be read, is it whole? {error}") from error

@@ -103,9 +103,6 @@ def certify(
 
     Returns:
         The certificate; None if the run has no limits or no checkpoints.
-
-    Raises:
-        ValueError: If the cap is not above every limit.
     """
     config = load_config(directory)
     folder = RunFolder(directory)
@@ -119,9 +116,8 @@ def certify(
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
-    settings = {name: getattr(options, name) for name in asked}
     highest: dict[str, float] = {}  # as of the first episodes
-    claim = Claim(limits, highest=highest, **settings)
+    claim = Claim(limits, highest=highest, **{name: getattr(options, name) for name in asked})
     groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
     first = [
         episodes

@@ -52,7 +52,7 @@ class CostCritics(QFunctionLoss):
 
     Attributes:
         cost_unit: u, the typical size of one cost (`EpisodeCosts.unit`), [k]; 1 before `calibrate`.
-        reward_unit: r, the standard deviation of the rewards of steps; 1 if they do not differ.
+        reward_unit: r, the standard deviation of the rewards of all steps; 1 while they are equal.
     """
 
     _in_keys: list[NestedKey]

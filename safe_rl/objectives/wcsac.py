@@ -73,7 +73,6 @@ class WCSACLoss(SACLagrangianLoss):
     """
 
     risk_measure = CVaR
-    """Risk measure of episode costs that may be limited, because the critics estimate it."""
 
     def __init__(self, *networks: Any, tail: Fraction, **settings: Any) -> None:
         self._factor = gaussian_tail(tail)

@@ -44,9 +44,8 @@ class Statement:
         """Upper confidence bound of the mean; `kind` is "betting" or "student"."""
         if kind == "student" and self.is_share:
             # exact (Clopper and Pearson 1934)
-            test = scipy.stats.binomtest(
-                int(self.values.sum()), len(self.values), alternative="less"
-            )
+            over = int(self.values.sum())
+            test = scipy.stats.binomtest(over, len(self.values), alternative="less")
             return float(test.proportion_ci(level, method="exact").high)
         if kind == "student":
             # a cost that is infinite or NaN has no bound
@@ -94,9 +93,6 @@ class Claim:
             every ν that is chosen before the test, and equal to it if a share α of the episodes
             costs more than ν.
 
-    Raises:
-        ValueError: If the cap is not above every limit: all policies would keep such a limit.
-
     Examples:
         >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
         >>> claim.shortfalls({"cost": [20.0, 21.0, 22.0, 20.0] * 25}, tests=1)
@@ -114,13 +110,11 @@ class Claim:
     thresholds: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for key, limit in self.limits.items():
-            if self.cap is not None and self.cap <= limit:
-                raise ValueError(
-                    f"cap={self.cap:g}: it must be above every limit, and that of '{key}' is "
-                    f"{limit:g}. No cost counts for more than the cap, so every policy would keep "
-                    "this limit."
-                )
+        if self.cap is not None and any(self.cap <= limit for limit in self.limits.values()):
+            raise ValueError(
+                f"cap={self.cap:g}: it must be above every limit in {dict(self.limits)}, or every "
+                "policy would keep that limit."
+            )
 
     def with_thresholds(self, costs: Costs) -> Claim:
         """The claim with ν set to the value at risk of episodes that are in no test."""

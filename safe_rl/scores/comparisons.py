@@ -169,6 +169,5 @@ def share_over(values: ArrayLike, limit: float) -> Estimate:
     """Share of values above a limit or NaN, with Wilson's interval of a proportion."""
     values = np.asarray(values, dtype=float)
     over = int((~(values <= limit)).sum())
-    test = scipy.stats.binomtest(over, len(values))
-    interval = test.proportion_ci(LEVEL, method="wilson")
+    interval = scipy.stats.binomtest(over, len(values)).proportion_ci(LEVEL, method="wilson")
     return Estimate(over / len(values), float(interval.low), float(interval.high))

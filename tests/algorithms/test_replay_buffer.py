@@ -214,13 +214,8 @@ def test_a_buffer_of_torchrl_passes_errors_to_the_sampler():
 
 def test_errors_are_read_where_the_loss_writes_them():
     actor = make_squashed_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
-    loss = SACLoss(
-        actor,
-        QEnsemble(1, 1, hidden_sizes=[8], num_networks=2),
-        gamma=0.9,
-        alpha_init=0.1,
-        target_entropy=-1.0,
-    )
+    q = QEnsemble(1, 1, hidden_sizes=[8], num_networks=2)
+    loss = SACLoss(actor, q, gamma=0.9, alpha_init=0.1, target_entropy=-1.0)
     loss.set_keys(priority="error")
     memory = make_memory(batch_size=8, keep=False, prioritised=EXPONENTS)
     memory.extend(make_batch(0, 10, rows=1))

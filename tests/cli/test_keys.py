@@ -150,7 +150,7 @@ def test_no_value_ends_in_a_traceback():
         ("model.initial_log_std", None, "model.initial_log_std=null: it must be"),
         ("model.hidden_sizes", [10**9], "model.hidden_sizes=[1000000000]: it must be a list"),
         ("init_from", 3, "init_from=3: it must be a text"),
-        ("certificate.cap", 25, "certificate.cap=25: it must be above every limit, and that of"),
+        ("certificate.cap", 25, "certificate.cap=25: it must be above every limit of"),
         ("collector.num_collectors", 0, "collector.num_collectors=0: it must be"),
         ("collector.num_collectors", 4, "use collector=process or collector=ray"),
         ("seed", 1e30, "seed=1e+30: it must be a whole number from 0 to"),

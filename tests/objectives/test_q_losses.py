@@ -148,9 +148,8 @@ def test_the_size_of_rewards_is_the_deviation_of_all_so_far():
         loss.measure(batch.reshape(-1, 10, 1))
     assert loss.reward_unit.item() == pytest.approx(rewards.numpy().std(), rel=1e-5)
     loss = make_loss("sac", lagrange(1.0, 1.0))
-    for _ in range(100):  # after some batches their sums are not exact
-        loss.measure(torch.full((20, 275), 0.3))
-        assert loss.reward_unit == 1
+    loss.measure(torch.full((275, 1), 0.1))  # so many that their sums are not exact
+    assert loss.reward_unit == 1
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])

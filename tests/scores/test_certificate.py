@@ -79,8 +79,7 @@ def test_every_limit_is_tested_at_the_level_of_the_test(kind):
         over = costs[key] > limit
         if kind == "student":
             expected[f"mean_{key}"] = student_bound(costs[key], level)
-            exact = stats.beta.ppf(level, over.sum() + 1, 50 - over.sum())
-            expected[f"over_limit_{key}"] = exact
+            expected[f"over_limit_{key}"] = stats.beta.ppf(level, over.sum() + 1, 50 - over.sum())
         else:
             expected[f"mean_{key}"] = betting_bound(costs[key], level, highest[key])
             expected[f"over_limit_{key}"] = betting_bound(over, level, 1.0)
@@ -112,8 +111,8 @@ def test_costs_without_a_highest_count_up_to_a_cap_and_few_may_cost_more():
     lower = replace(CLAIM, cap=50.0).bounds({"cost": costs}, tests=1)
     assert list(lower) == ["beyond_50_cost", "mean_cost"]
     assert list(replace(CLAIM, cap=300.0).bounds({"cost": costs}, tests=1)) == ["mean_cost"]
-    with pytest.raises(ValueError, match="cap=25: it must be above every limit, and that of"):
-        replace(CLAIM, cap=25.0)  # which the mean of capped costs could not exceed
+    with pytest.raises(ValueError, match="cap=25: it must be above every limit"):
+        replace(CLAIM, cap=25.0)
     many = np.r_[np.full(780, 10.0), np.full(20, 260.0)]
     assert list(Claim({"cost": 25.0}).shortfalls({"cost": many}, tests=1)) == ["beyond_250_cost"]
 
@@ -163,7 +162,6 @@ def test_a_cost_that_is_no_number_is_never_below_its_limit(odd):
     bounds = claim.bounds({"cost": costs}, tests=1)
     assert bounds["mean_cost"][0] == np.inf
     assert bounds["over_limit_cost"][0] == betting_bound(np.arange(401) == 0, 0.95, 1.0)
-    # even if no cost can be above the limit, or only episodes of the ranking have such a cost
     student = replace(CLAIM, bound="student", highest={"cost": 20.0})
     assert student.bounds({"cost": costs}, tests=1)["mean_cost"][0] == np.inf
     cvar = replace(CLAIM, tail=0.1).with_thresholds({"cost": [0.0, odd]})
