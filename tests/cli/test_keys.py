@@ -219,6 +219,7 @@ def test_parts_of_ones_own_are_checked_by_what_they_inherit(monkeypatch):
     assert "outcome has no such argument" in outcome(config, "lagrangian.init", 1.0)
 
 
+@pytest.mark.filterwarnings("ignore:'constrain_")  # there are no objects of any kind
 @pytest.mark.parametrize("key", sorted(SafetyGymConfig().to_dict()))
 def test_environments_refuse_in_a_line(key):
     for value in WRONG:
