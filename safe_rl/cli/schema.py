@@ -202,7 +202,7 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
         return f"algo={algo.get('name')} has no '{section}'."
     if section == "env" and (reason := on_cpu_only(key.removeprefix("env."))):
         return f"there is no key '{key}'.{reason}"
-    if choice := _choice_with(key):
+    if section != "preset" and (choice := _choice_with(key)):  # a preset's keys are at the top
         target = str((values.get(section) or {}).get("_target_") or "safe_rl.")
         own = f": {target} has no such argument. Choose your class by a YAML file ({section}=…)."
         reason = f" without {choice}." if target.startswith("safe_rl.") else own

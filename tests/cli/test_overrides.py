@@ -25,6 +25,7 @@ RIGHT = [
 WRONG = {
     "env.hazard_num=3": r"there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
     "total_timesteps=3": "there is no key 'total_timesteps'. Did you mean 'frames'",
+    "preset.frames=3": "there is no key 'preset.frames'. Did you mean 'frames'",
     "frmaes=3": "there is no key 'frmaes'. Did you mean 'frames'",
     "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
     "policy_update.lr=1e-4": "Did you mean 'policy_update.optimizer.lr'",
