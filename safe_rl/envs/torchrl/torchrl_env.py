@@ -162,9 +162,10 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
             rows.reset()
             return rows
         except Exception as error:  # custom code may raise any error
-            if not make.func.__module__.startswith("torchrl."):
+            maker = make.func if hasattr(make.func, "__name__") else type(make.func)
+            if not maker.__module__.startswith("torchrl."):
                 warnings.warn(
-                    f"{make.func.__name__} cannot step several rows at once, so its environments "
+                    f"{maker.__name__} cannot step several rows at once, so its environments "
                     f"are stepped one after the other. {type(error).__name__}: {error}",
                     stacklevel=2,
                 )
