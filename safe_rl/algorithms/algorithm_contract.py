@@ -47,9 +47,10 @@ class Algorithm(ABC):
         networks: Trained networks, by name. Another run can start from them.
         cost_networks: Names of the networks of the constrained costs. A run starts from another
             run's cost networks only if both have the same costs.
-        learns_from: A sentence on the data besides the run's own steps that it learns from.
+        learns_from: A sentence on the data besides the run's own steps that it learns from; empty
+            if there are none.
         schedule: A sentence on when the limits begin to hold; empty if they do from the start.
-        lost_on_resume: A sentence on the state that checkpoints do not have.
+        lost_on_resume: A sentence on the state that checkpoints do not have; empty if none.
     """
 
     cost_keys: Sequence[str] = ()

@@ -42,6 +42,9 @@ class Memory(Checked):
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
 
+    Raises:
+        ValueError: If ``prioritised`` has other keys than these two.
+
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],

@@ -116,7 +116,7 @@ def certify(
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
-    highest: dict[str, float] = {}  # as of the first episodes
+    highest: dict[str, float] = {}  # `_run` writes it before the claim is tested
     claim = Claim(limits, highest=highest, **{name: getattr(options, name) for name in asked})
     groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
     first = [

@@ -96,7 +96,7 @@ class CertificateOptions:
         level: Confidence of a certificate.
         most_over: Share of episodes that may cost more than a limit; 1: no bound on this share.
         bound: Kind of upper confidence bound of means; betting holds for all costs.
-        cap: Cost up to which an episode counts, above all limits; null: all, if they are bounded.
+        cap: Cost up to which an episode counts, above all limits; null: all, if costs are bounded.
         most_beyond: Share of episodes that may cost more than the cap.
         tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all episodes.
     """

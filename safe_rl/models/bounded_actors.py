@@ -99,7 +99,8 @@ class SquashedNormal(TanhNormal):
     """A `TanhNormal` that is built when a method other than `rsample_and_log_prob` is called.
 
     Soft actor-critics only call this method, twice per update. Building the transforms and checking
-    the bounds takes six times as long. ``loc`` and ``scale``, [..., A], are those before the tanh.
+    the bounds takes six times as long. ``loc`` and ``scale``, [..., A], are those before the tanh;
+    the bounds are [A].
     """
 
     def __init__(self, loc: Tensor, scale: Tensor, low: Tensor, high: Tensor) -> None:

@@ -216,6 +216,9 @@ class CostGAE(VectorGAE):
         value_network: Cost critic, which writes ``cost_value`` [..., T, k]; None: see `VectorGAE`.
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
+    Raises:
+        ValueError: If ``cost_keys`` is empty.
+
     Examples:
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
         >>> estimator = CostGAE(["cost_hazards", "cost_vases_contact"], None, **settings)

@@ -166,6 +166,9 @@ class BCLoss(ReplayLoss):
         actor_network: Deterministic policy, which writes the action alone.
         loss_function: Distance between the policy's actions and the recorded ones.
 
+    Raises:
+        ValueError: If the policy writes more than the action, as a probabilistic one does.
+
     Examples:
         >>> import torch
         >>> from safe_rl.models import make_bounded_actor

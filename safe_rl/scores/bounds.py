@@ -56,7 +56,7 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     value is NaN, infinite or above ``highest``.
 
     Raises:
-        ValueError: If ``highest`` is not finite, and all values are.
+        ValueError: If all values are finite, but ``highest`` is not.
 
     Examples:
         >>> round(betting_bound([20.0, 22.0, 24.0, 26.0] * 50, level=0.95, highest=50.0), 2)

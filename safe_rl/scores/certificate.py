@@ -93,6 +93,9 @@ class Claim:
             every ν that is chosen before the test, and equal to it if a share α of the episodes
             costs more than ν.
 
+    Raises:
+        ValueError: If the cap is not above every limit.
+
     Examples:
         >>> claim = Claim({"cost": 25.0}, highest={"cost": 50.0})
         >>> claim.shortfalls({"cost": [20.0, 21.0, 22.0, 20.0] * 25}, tests=1)

@@ -78,8 +78,8 @@ class WorldSnapshot:
         """Start instance i of N at step i · max_steps / N of its first episode.
 
         Then the episodes of different instances end at different times. All instances start at a
-        multiple of the environment steps per decision. Returns whether this was possible: the
-        environment's state must have a ``step_count``.
+        multiple of ``multiple``, the environment steps per decision. Returns whether this was
+        possible: the environment's state must have a ``step_count``.
         """
         state = self._env.get_state()
         steps = state.get("step_count", None)

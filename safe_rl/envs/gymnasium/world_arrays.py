@@ -106,8 +106,9 @@ class Worlds:
 
     def _reset(self, mask: np.ndarray | None = None) -> Observation:
         """Start episodes in all rows or in those of a mask [N]; return the observation of all."""
-        new = None if mask is None else torch.from_numpy(mask).unsqueeze(-1)
-        ask = None if new is None else TensorDict({"_reset": new}, len(new))
+        ask = None
+        if mask is not None:
+            ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
         # TorchRL's `reset` would return zeros for the other rows
         return arrays_of(self.batch._reset(ask)["observation"])
 

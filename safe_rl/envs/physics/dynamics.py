@@ -21,7 +21,7 @@ _LINEAR = (
 def scale_dynamics(model: mujoco.MjModel, scales: Mapping[str, float], bodies: slice) -> None:
     """Change a compiled model in place by the factors of a robot, whose body ids are `bodies`.
 
-    They are given by key of `SCALES`; a factor of 1 changes no bit.
+    `scales` has a factor by key of `SCALES`; missing ones are 1. A factor of 1 changes no bit.
 
     Raises:
         ConfigError: If the force of an actuator is no linear function of its gain, as for a muscle.

@@ -79,7 +79,7 @@ def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _R
 
 
 class _Root:
-    """Rotations of free roots since the start of the substep, with the `quaternion` [N, 4]."""
+    """Rotations of free roots since the start of the substep, from orientations [N, 4]."""
 
     def __init__(self, quaternion: Tensor) -> None:
         unit = quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True)

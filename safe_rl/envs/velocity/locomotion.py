@@ -31,16 +31,22 @@ class Place(NamedTuple):
     reading: Callable[[mujoco.MjModel, BatchPhysics], Callable[[], Tensor]]
 
 
+def _x(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+    return lambda: physics.qpos[:, :1].clone()
+
+
+def _torso(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+    return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
+
+
 def _centre_of_mass(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
     shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
     return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
 
 
 PLACES: Mapping[str, Place] = {
-    "x": Place((), lambda model, physics: lambda: physics.qpos[:, :1].clone()),
-    "torso": Place(
-        ("xpos",), lambda model, physics: lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
-    ),
+    "x": Place((), _x),
+    "torso": Place(("xpos",), _torso),
     "centre_of_mass": Place(("xipos",), _centre_of_mass),
 }
 
@@ -101,9 +107,10 @@ def locomotion_reward(
     healthy: Tensor,
     outputs: Mapping[str, Tensor],
 ) -> Tensor:
-    """Reward for forward velocity (m/s) and health, minus costs of control and contact, [N] each.
+    """Reward [N] for forward velocity and health, minus costs of control and contact.
 
-    With a contact weight, the output `cfrc_ext` [N, nbody, 6] (N m, N) of the physics is read.
+    `velocity_x` (m/s) and `healthy` are [N], `control` is [N, nu]. With a contact weight,
+    the output `cfrc_ext` [N, nbody, 6] (N m, N) of the physics is read.
     """
     reward = config.forward_reward_weight * velocity_x
     if config.healthy_reward is not None:
