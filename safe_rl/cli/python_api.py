@@ -93,6 +93,8 @@ def train(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
+    if "resume" in settings:
+        raise CommandLineError("safe_rl.resume(directory) continues a run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
     words += [f"--config-dir={place}" for place in folders]

@@ -188,6 +188,8 @@ def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, messa
 def test_environments_and_algorithms_are_names(choice, tmp_path):
     with pytest.raises(ValueError, match=r"^env and algo are names\. .*store_config.*config_dir"):
         safe_rl.train(directory=tmp_path / "run", **choice)
+    with pytest.raises(ValueError, match=r"safe_rl\.resume"):
+        safe_rl.train(resume=str(tmp_path))
 
 
 def test_a_run_is_measured_against_other_limits(run):
