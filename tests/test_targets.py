@@ -90,7 +90,7 @@ def test_partial_nodes_wait_for_their_arguments():
         *("safe_rl.envs.gymnasium.FloatCosts", "safe_rl.envs.from_gymnasium"),
         *("safe_rl.collectors.StepRecorder", "safe_rl.collectors.recording.Recording"),
         "safe_rl.envs.gymnasium.from_gymnasium",
-        "safe_rl.algorithms.off_policy_parts.read_dataset",
+        "safe_rl.algorithms.dataset.read_dataset",
         # what classes have of others
         *("safe_rl.objectives.PPOLoss.load_state_dict", "safe_rl.objectives.PPOLoss.__class__"),
         *("safe_rl.objectives.policy_losses.__builtins__.eval", "safe_rl.objectives.PPOLoss.mro"),

@@ -50,7 +50,6 @@ class Algorithm(ABC):
         learns_from: A sentence on the data besides the run's own steps that it learns from; empty
             if there are none.
         schedule: A sentence on when the limits begin to hold; empty if they do from the start.
-        lost_on_resume: A sentence on the state that checkpoints do not have; empty if none.
     """
 
     cost_keys: Sequence[str] = ()
@@ -59,7 +58,11 @@ class Algorithm(ABC):
     cost_networks: Collection[str] = ()
     learns_from: str = ""
     schedule: str = ""
-    lost_on_resume: Any = ""  # a text, or a property
+
+    @property
+    def lost_on_resume(self) -> str:
+        """A sentence on the state that checkpoints do not have; empty if they have all of it."""
+        return ""
 
     @abstractmethod
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:

@@ -21,11 +21,11 @@ from safe_rl.algorithms.build_part import (
     constrained_limits,
 )
 from safe_rl.algorithms.constraints import Constraints
-from safe_rl.algorithms.off_policy_parts import (
+from safe_rl.algorithms.dataset import fill_replay_buffer
+from safe_rl.algorithms.off_policy_networks import (
     bounded_actions,
     build_networks,
     exploring,
-    fill_replay_buffer,
     setting,
 )
 from safe_rl.algorithms.replay_buffer import Memory

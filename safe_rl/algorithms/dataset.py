@@ -1,120 +1,20 @@
-"""Parts of off-policy algorithms, as a configuration describes them.
-
-These are the networks, and the transitions of a dataset in the replay buffer, before or instead of
-collected ones.
-"""
+"""Put transitions of a dataset into the replay buffer, before or instead of collected ones."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.build_part import build_part
 from safe_rl.algorithms.constraints import check_cost_limits
+from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 from safe_rl.files import read_config
-from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
-from safe_rl.models.encoders import TO_FLATTEN, observed_entries
-
-_ON_POLICY_ONLY = ("encoders", "memory", "normalise")
-
-
-def setting(config: DictConfig, key: str) -> Any:
-    """The value of a required key.
-
-    Raises:
-        ValueError: If the key is missing or null.
-    """
-    value = OmegaConf.select(config, key)
-    if value is None:
-        raise ValueError(f"{key} is missing: off-policy algorithms need it.")
-    return value
-
-
-def bounded_actions(env: EnvBase) -> TensorSpec:
-    """Spec of one environment's bounded action, [A], in single precision like the networks.
-
-    Raises:
-        ValueError: If actions are not continuous within finite bounds, or no vectors [A].
-    """
-    spec = env.action_spec_unbatched
-    is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
-    if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
-        raise ValueError(
-            "Off-policy algorithms need continuous actions within bounds, and this environment's "
-            f"action_spec is {type(spec).__name__}. Use an on-policy one such as ppo_lagrangian."
-        )
-    if len(spec.shape) != 1:
-        raise ValueError(
-            f"An action of this environment has the shape {list(spec.shape)}: policies act by "
-            "vectors [A]. Let the environment take them, and give them their shape itself."
-        )
-    return spec.to(torch.float32)
-
-
-def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
-    """The exploring policy of an actor, within the bounds of an environment's actions."""
-    spec = bounded_actions(env)
-    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
-
-
-def build_networks(
-    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
-) -> dict[str, Any]:
-    """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
-
-    Args:
-        config: Configuration as composed from ``conf/``.
-        env: Environment whose specs have the sizes of observations and actions.
-        num_costs: Number of constrained costs; 0: no cost critics.
-        device: Device of the parameters.
-
-    Raises:
-        ValueError: If actions have no bounds, the observation is no vector, or the model is one for
-            on-policy algorithms.
-    """
-    model, spec = config.model, bounded_actions(env)
-    size, actions = _observation_size(config, env), len(spec.low)
-    common: dict[str, Any] = {
-        "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
-        "device": device,
-    }
-    bounds = {"low": spec.low, "high": spec.high}
-    networks = {"actor": build_part(config.actor, observation_size=size, **bounds, **common)}
-    if number := setting(config, "critics.rewards"):
-        networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
-    if num_costs and (number := setting(config, "critics.costs")):
-        common |= {"num_outputs": num_costs, "out_key": "cost_state_action_value"}
-        networks["cost_critic"] = QEnsemble(size, actions, num_networks=number, **common)
-    return networks
-
-
-def _observation_size(config: DictConfig, env: EnvBase) -> int:
-    """Length of the observation; refuses models and observations that are not of one vector."""
-    model = config.model
-    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
-        raise ValueError(
-            f"algo={config.algo.name} takes model=mlp only, and model.{others[0]} is for on-policy "
-            "algorithms. Use model=mlp without it."
-        )
-    observed = observed_entries(env.observation_spec)
-    if observed[0].key != "observation" or len(observed[0].shape) != 1:
-        raise ValueError(
-            f"algo={config.algo.name} needs an observation of one vector, and this environment "
-            f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
-            "with model=dict or model=cnn."
-        )
-    return int(observed[0].shape[0])
 
 
 def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tuple[str, bool]:
