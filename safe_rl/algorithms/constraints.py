@@ -187,8 +187,12 @@ class TrackedConstraints(Constraints):
     J_c minus its target, plus an integral of earlier violations, divided by the share of predicted
     changes that is observed. Multipliers get J_c minus its target.
 
-    The tracker estimates J_c and computes its current target. If there is a risk measure, it is
-    limited instead of the mean cost of an episode.
+    Args:
+        limits: Cost key -> d, undiscounted cost allowed per episode.
+        tracker: Tracker that estimates J_c and computes its current target.
+        multiplier: Multiplier that weighs the costs against the return, or None.
+        risk: Risk measure that is limited instead of the mean cost of an episode, or None.
+        device: Device of all tensors.
     """
 
     state_names = ("tracker", "risk")

@@ -132,8 +132,14 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     """Multipliers of the projection onto half-spaces bᵢᵀx + cᵢ ≤ 0, in the metric L.
 
     The nearest point to x₀ is x₀ − Σᵢ νᵢ L⁻¹bᵢ, where ν ≥ 0 minimises ½ νᵀSν − νᵀe with
-    e = b x₀ + c (`excess`, [k]) and Sᵢⱼ = bᵢᵀL⁻¹bⱼ (`gram`, [k, k]). For one half-space,
-    ν = max(0, e/s). Constraints without a gradient are left out. Returns ν, [k].
+    e = b x₀ + c and Sᵢⱼ = bᵢᵀL⁻¹bⱼ. For one half-space, ν = max(0, e/s).
+
+    Args:
+        excess: e, [k].
+        gram: S, [k, k]; positive semi-definite. Constraints without a gradient are left out.
+
+    Returns:
+        ν, [k].
 
     Examples:
         >>> nearest_feasible(torch.tensor([2.0, -1.0]), torch.tensor([[4.0, 0.0], [0.0, 1.0]]))

@@ -17,9 +17,15 @@ from safe_rl.ranges import Fraction, NotNegative
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
     """Bregman divergence, for x log x, between two distances of a cost to its limit.
 
-    D(s − a, s) = a + (s − a) log((s − a)/s) for an increase a of the cost (`change`), whose
-    distance to its limit was s > 0 (`slack`): 0 with a slope of 0 at a = 0, of curvature 1/s there,
+    D(s − a, s) = a + (s − a) log((s − a)/s): 0 with a slope of 0 at a = 0, of curvature 1/s there,
     and infinite beyond the limit.
+
+    Args:
+        change: Increase a of the cost, any shape.
+        slack: Distance s > 0 of the cost to its limit before the increase, of the same shape.
+
+    Returns:
+        The divergence, of this shape.
 
     Examples:
         >>> barrier_divergence(torch.tensor([0.0, 5.0, 15.0]), torch.tensor([10.0, 10.0, 10.0]))

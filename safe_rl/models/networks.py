@@ -161,10 +161,17 @@ def assemble_actor(
     in_keys: Sequence[NestedKey] = ("observation",),
     before: Sequence[TensorDictModuleBase] = (),
 ) -> ProbabilisticTensorDictSequential:
-    """Put a head on a network that reads the entries ``in_keys``; modules `before` may write these.
+    """Put a head on a network.
 
-    The result has ``get_dist``, and writes the distribution's parameters, ``action`` and
-    ``action_log_prob``, shape [...].
+    Args:
+        body: Network from the entries ``in_keys`` to the inputs of the head.
+        head: Maps these to a distribution.
+        in_keys: Keys of the observation.
+        before: Modules that write the entries ``in_keys``, if the environment does not.
+
+    Returns:
+        A module with ``get_dist`` that writes the distribution's parameters, ``action`` and
+        ``action_log_prob``, shape [...].
     """
     parameters = Chain(body, head.parameters)
     return ProbabilisticTensorDictSequential(

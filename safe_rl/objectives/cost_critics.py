@@ -147,10 +147,16 @@ class CostCritics(QFunctionLoss):
     def cost_errors(
         self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
-        """Distance of the critics from their TD(0) targets, for every step, [E, ..., k].
+        """Distance of the critics from their TD(0) targets, for every step.
 
-        `found` and `following` are outputs [E, ..., k] of the networks, and of the target networks
-        in the next state, whose value has the `discount` [..., 1], 0 if the episode terminated.
+        Args:
+            found: Outputs of the networks, [E, ..., k].
+            costs: Costs of the steps, [..., k].
+            discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
+            following: Outputs of the target networks in the next state, [E, ..., k].
+
+        Returns:
+            The distances, [E, ..., k].
         """
         target = costs + discount * self.bounded(following)
         return distance_loss(found, target, loss_function=self.loss_function)

@@ -41,9 +41,14 @@ class CostEstimate(NamedTuple):
 
 
 def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
-    """J_c as cost per step [N, T, k] times mean episode length T̄, and its standard error over rows.
+    """J_c as cost per step times steps per episode, with the standard error over rows.
 
-    If there are few rows, they are cut into pieces that are taken as independent.
+    Args:
+        costs: Costs of N rows of T consecutive steps, [N, T, k].
+        length: Mean episode length T̄ in steps, scalar.
+
+    Returns:
+        The estimate. If there are few rows, they are cut into pieces that are taken as independent.
 
     Examples:
         >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)
@@ -61,9 +66,13 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
 def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEstimate:
     """Average two estimates by their precision: one step of a Kalman filter on a random walk.
 
-    Of the estimates for the policies so far (NaN if there is none) and of this batch alone, it
-    makes one for the present policy. Its error is at most that of the batch. `drift`, [k], is the
-    standard deviation of the change of J_c from one policy to the next.
+    Args:
+        past: Estimate for the policies so far; NaN if there is none.
+        present: Estimate of this batch alone.
+        drift: Standard deviation of the change of J_c from one policy to the next, [k].
+
+    Returns:
+        The estimate for the present policy, with an error of at most `present.error`.
 
     Examples:
         >>> one, two = torch.ones(1), torch.tensor([2.0])

@@ -65,10 +65,19 @@ def gae(
     gamma: float,
     lmbda: float,
 ) -> Tensor:
-    """Generalised advantage estimates (Schulman et al. 2016, equation 16), [..., T, F].
+    """Generalised advantage estimate (Schulman et al. 2016, equation 16).
 
-    Rewards and the values of observations and next observations are [..., T, F]; ``done`` (ends of
-    trajectories) and ``terminated`` (ends after which values are not bootstrapped) are [..., T, 1].
+    Args:
+        reward: [..., T, F], F reward-like signals.
+        value: [..., T, F], values of the observations.
+        next_value: [..., T, F], values of the next observations.
+        done: [..., T, 1] bool, trajectory ends.
+        terminated: [..., T, 1] bool, ends after which values are not bootstrapped.
+        gamma: Discount per step.
+        lmbda: Decay of the TD errors.
+
+    Returns:
+        Advantages, [..., T, F].
     """
     if gamma * lmbda == 0:
         # With a decay of 0, TorchRL's function loses even the first TD error.
