@@ -105,8 +105,8 @@ class MinibatchUpdate(PolicyUpdate):
         compile: Whether to compile the loss and its gradient with torch.compile.
 
     Raises:
-        ValueError: If ``adapt_rate`` is set without ``max_kl``. By the call, if ``max_kl`` is set
-            and the loss reports no scalar ``kl``.
+        ValueError: If an argument is outside its range, or ``adapt_rate`` is set without
+            ``max_kl``. By the call, if ``max_kl`` is set and the loss reports no scalar ``kl``.
         FloatingPointError: By the call, if an entry of the batch is not finite, before any step; or
             if a loss is not finite, before the step on this loss.
 

@@ -37,8 +37,8 @@ class ReplayUpdate(Checked):
 
     Raises:
         TypeError: If the loss is no `ReplayLoss`.
-        ValueError: If no parameter's name begins with a key of ``rates``, or the loss has target
-            networks and ``tau`` is None.
+        ValueError: If an argument is outside its range, no parameter's name begins with a key of
+            ``rates``, or the loss has target networks and ``tau`` is None.
         FloatingPointError: By the call, if a loss is not finite, before the step on this loss.
 
     Examples:

@@ -25,10 +25,15 @@ from safe_rl.ranges import Checked, NotNegative
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
-    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ), of surrogates per sample, [..., 1] and [..., k].
+    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ).
 
     The division keeps the step size of an optimiser independent of λ (Stooke, Achiam and
     Abbeel 2020, section 4.4).
+
+    Args:
+        reward_gain: Per-sample reward surrogate, [..., 1].
+        cost_gain: Per-sample cost surrogates, [..., k].
+        multipliers: λ, [k].
     """
     penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
     return (reward_gain - penalty) / (1 + multipliers.sum())
@@ -37,7 +42,9 @@ def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> T
 def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Tensor:
     """Kish's effective sample size of importance weights, as a fraction of the samples.
 
-    The mask, bool with as many elements, says which weights count; None: all.
+    Args:
+        log_weight: Logarithms of the weights, any shape.
+        mask: Bool mask of the weights that count, with the same number of elements; None: all.
     """
     log_weight = log_weight.flatten()
     if mask is not None:

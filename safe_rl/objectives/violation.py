@@ -38,6 +38,10 @@ def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
 
     Before the first batch J_c is NaN, which counts as 0: the policy is assumed to be at its limits.
 
+    Args:
+        violation: J_c − d of every constraint, [k].
+        surrogates: Cost surrogates, [k].
+
     Raises:
         ValueError: If there is not one violation per surrogate.
 
@@ -66,9 +70,14 @@ def constraint_value(
 ) -> Tensor:
     """c, the constraint violation in the units of the cost surrogate's gradient, [k].
 
-    A cost surrogate is an average per step, so the violation of an episode's cost has to be divided
-    by the episode's length, if `rescale_violation` is set. NaN (no episode has finished) counts as
-    0: the policy is assumed to be at the limit, and must not raise the cost.
+    A cost surrogate is an average per step, so the violation of an episode's cost has to be
+    divided by the episode's length.
+
+    Args:
+        cost_violation: J_c − d, [k]. NaN (no episode has finished) counts as 0: the policy is
+            assumed to be at the limit, and must not raise the cost.
+        episode_length: T̄, scalar.
+        rescale_violation: Whether to divide.
     """
     divisor = episode_length if rescale_violation else torch.ones_like(episode_length)
     return (cost_violation / divisor).nan_to_num(nan=0.0)

@@ -1,7 +1,4 @@
-"""Upper confidence bounds of means: by betting, which holds for bounded values, and Student's.
-
-`values` are independent, [n], in the order of their draws. `level` is the confidence, in (0.5, 1).
-"""
+"""Upper confidence bounds of means: by betting, which holds for bounded values, and Student's."""
 
 from __future__ import annotations
 
@@ -31,8 +28,15 @@ def log_wealth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
     The player divides a wealth of 1 among bets λ. Every value multiplies the wealth of each bet by
     1 + λ (mean − value). If the values' true mean is ``mean`` or more, the expected wealth does not
     grow, and the probability that the wealth ever reaches 1/α is at most α (Ville's inequality;
-    Waudby-Smith and Ramdas 2024, section 4). Values are from 0 to ``highest``, and ``mean`` is
-    below it. Returns the log of the total wealth, [n].
+    Waudby-Smith and Ramdas 2024, section 4).
+
+    Args:
+        values: Independent values from 0 to ``highest``, in the order of their draws, [n].
+        mean: The hypothetical mean, below ``highest``.
+        highest: The largest possible value.
+
+    Returns:
+        Log of the total wealth, [n].
 
     Examples:
         >>> log_wealth([0.0] * 4, mean=0.5, highest=1.0).round(2).tolist()
@@ -52,8 +56,15 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     """Upper confidence bound of the mean of values in [0, ``highest``], for any distribution.
 
     It is the largest mean that :func:`log_wealth` does not exclude. The bounds after 1, 2, … values
-    hold simultaneously: one may stop as soon as a bound is low enough. The bound is infinite if a
-    value is NaN, infinite or above ``highest``.
+    hold simultaneously: one may stop as soon as a bound is low enough.
+
+    Args:
+        values: Independent values, [n].
+        level: Confidence, in (0.5, 1).
+        highest: The largest possible value; finite.
+
+    Returns:
+        The bound; infinite if a value is NaN, infinite or above ``highest``.
 
     Raises:
         ValueError: If all values are finite, but ``highest`` is not.
@@ -84,8 +95,14 @@ def student_bound(values: ArrayLike, level: float) -> float:
 
     It is x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t. γ is twice the
     sample's skewness, or 0 if that is negative (Chen, "Testing the mean of skewed distributions",
-    1995). The bound is too low if high values are so rare that the sample has none. It is infinite
-    for fewer than two values, and if all are equal or one is not finite.
+    1995). The bound is too low if high values are so rare that the sample has none.
+
+    Args:
+        values: Independent values, [n].
+        level: Confidence, in (0.5, 1).
+
+    Returns:
+        The bound; infinite for fewer than two values, and if all are equal or one is not finite.
 
     Examples:
         >>> round(student_bound([20.0, 22.0, 24.0, 26.0], level=0.95), 2)

@@ -140,6 +140,9 @@ class Saute(_ChangesReward):
         rescale_budgets: Whether d becomes d (1 - γ_s^T) / ((1 - γ_s) T), as in the published code:
             the discounted sum of a cost d that is spread evenly over T = `max_episode_steps` steps.
 
+    Raises:
+        ValueError: For a budget that is not positive, or a discount out of range.
+
     Examples:
         >>> from torchrl.envs import TransformedEnv
         >>> from safe_rl.envs import SafetyGymEnv
@@ -230,6 +233,9 @@ class Simmer(Saute):
         first: Share of d with which training begins.
         steps: Steps of each environment after which the budget is the whole d.
         settings: Other arguments of `Saute`.
+
+    Raises:
+        ValueError: For a value out of range.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
