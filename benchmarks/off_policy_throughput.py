@@ -85,7 +85,7 @@ def ours(args: argparse.Namespace) -> Callable[[], None]:
     )
     memory = Memory(
         capacity=20_000, batch_size=args.batch_size, in_keys=loss.in_keys,
-        reward_keys=["reward", "cost"], reward_gamma=0.99, n_steps=1, storage="tensor", keep=False,
+        reward_keys=["reward", "cost"], reward_gamma=0.99, n_steps=1, keep=False,
     )  # fmt: skip
     memory.extend(random_steps(50, 400, args.observation_size))
     update = ReplayUpdate(
@@ -93,7 +93,6 @@ def ours(args: argparse.Namespace) -> Callable[[], None]:
         optimizer=functools.partial(torch.optim.Adam, lr=1e-3, fused=True),
         updates_per_step=0.05,
         tau=0.01,
-        compile=args.compile,
     )
     return lambda: update(memory, args.updates)
 
@@ -125,7 +124,6 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=50)
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--compile", action="store_true")
     parser.add_argument("--plain", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

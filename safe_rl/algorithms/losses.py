@@ -59,7 +59,7 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
     ]
     return FloatingPointError(
         f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
-        "This step is not taken. Lower the learning rate, or look for a policy that has collapsed."
+        "Lower the learning rate, or look for a policy that has collapsed."
     )
 
 

@@ -153,7 +153,8 @@ class Session:
     def _prepare(self) -> Trainer | None:
         """Build the run, or continue the one in the folder; None if that is finished."""
         if "RL_LOGGING_LEVEL" not in os.environ:  # which users set to see more of TorchRL's notes
-            logging.getLogger("torchrl").setLevel(logging.WARNING)
+            for library in ("torchrl", "tensordict"):
+                logging.getLogger(library).setLevel(logging.WARNING)
         config, folder, callbacks = self.config, self.folder, self._callbacks
         if not (isinstance(callbacks, list | tuple) and all(map(callable, callbacks))):
             raise ConfigError(f"callbacks must be a list of functions, [f], got {callbacks!r}.")

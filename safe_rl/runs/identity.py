@@ -73,6 +73,7 @@ ROLES: dict[str, Role] = {
     "compile": Role.MACHINE,
     "env.physics_buffers": Role.MACHINE,
     "*.compile": Role.MACHINE,
+    "policy_update.cuda_graph": Role.MACHINE,
     "device": Role.MACHINE,
     "import": Role.MACHINE,
     "logger": Role.MACHINE,

@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from safe_rl.algorithms import Memory, PolicyUpdate, ReplayUpdate
-from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import SACLoss
+from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
+from safe_rl.objectives import SACLoss, TD3Loss
 
 
 def make_update(seed, tau=0.1, **keys):
@@ -27,12 +27,29 @@ def make_update(seed, tau=0.1, **keys):
     return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=tau, **keys)
 
 
+def make_td3(device="cpu", kind=TD3Loss, **keys):
+    """A TD3 update without noise, so that nothing in its steps is random."""
+    torch.manual_seed(0)
+    spec = Bounded(-1, 1, [2])
+    loss = kind(
+        make_bounded_actor(3, spec.low, spec.high, hidden_sizes=[8]),
+        QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
+        **{"action_spec": spec, "gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5},
+    ).to(device)
+    adam = partial(torch.optim.Adam, lr=0.01)
+    return ReplayUpdate(loss, optimizer=adam, updates_per_step=1, tau=0.1, **keys)
+
+
 @pytest.fixture
 def memory():
+    return fill()
+
+
+def fill(**keys):
     generator = torch.Generator().manual_seed(0)
     memory = Memory(
         capacity=100, batch_size=16, in_keys=make_update(0).loss.in_keys, reward_keys=["reward"],
-        reward_gamma=0.9, n_steps=1, keep=False,
+        reward_gamma=0.9, n_steps=1, keep=False, **keys,
     )  # fmt: skip
     flags = torch.zeros(2, 40, 1, dtype=torch.bool)
     following = {"observation": torch.randn(2, 40, 3, generator=generator), "done": flags}
@@ -119,3 +136,41 @@ def test_constructors_are_checked_unless_an_annotation_cannot_be_read():
             return {}
 
     assert Own(None, size=3).size == 3
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("prioritised", "keys"),
+    [(None, {"max_grad_norm": 1.0}), ({"alpha": 0.6, "beta": 0.4}, {"policy_delay": 2})],
+)
+def test_cuda_graphs_take_the_steps_of_python_also_after_a_checkpoint(prioritised, keys):
+    found = []
+    for cuda_graph in (False, True):
+        update = make_td3("cuda", cuda_graph=cuda_graph, **keys)
+        memory = fill(prioritised=prioritised, device="cuda")
+        torch.manual_seed(1)
+        for number in (1, 20, 20):
+            row = update(memory, number)
+            update.load_state_dict(deepcopy(update.state_dict()))
+        found.append((row, networks(update)))
+    torch.testing.assert_close(found[1], found[0], rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.gpu
+def test_cuda_graphs_tell_of_losses_that_diverge_and_of_those_that_cannot_be_recorded():
+    class OnHost(TD3Loss):
+        def actor_losses(self, tensordict):
+            losses = super().actor_losses(tensordict)
+            return losses.set("qvalue", torch.tensor(losses["qvalue"].item(), device="cuda"))
+
+    memory = fill(device="cuda")
+    assert make_td3("cuda", OnHost, cuda_graph=False)(memory, 5)["qvalue"].isfinite()
+    update = make_td3("cuda")
+    update(memory, 5)
+    update.loss.qvalue_network_params.data.apply_(lambda tensor: tensor.fill_(torch.nan))
+    with pytest.raises(FloatingPointError, match="'loss_qvalue' is nan"):
+        update(memory, 5)
+    # last, because a failed recording can break what follows
+    with pytest.raises(RuntimeError) as failed:
+        make_td3("cuda", OnHost)(memory, 5)
+    assert "policy_update.cuda_graph=false" in failed.value.__notes__[0]
