@@ -44,6 +44,7 @@ class ReplayUpdate(Checked):
         cuda_graph: On a GPU, whether to record gradient steps as CUDA graphs, which take a tenth of
             the time. The loss's Python code then runs only in the first steps: use False if it
             reads numbers on the host (``.item()``) or has attributes that change during training.
+            Optimisers without a setting ``capturable``, such as SGD, are never recorded.
 
     Raises:
         TypeError: If the loss is no `ReplayLoss`.
@@ -98,7 +99,9 @@ class ReplayUpdate(Checked):
                 f"tau is null, but {type(loss).__name__} has target networks: they would never "
                 "change. Set the step towards the networks, such as tau=0.01."
             )
-        self._recorded = cuda_graph and self._device.type == "cuda"
+        # optimisers without this setting may count their steps in Python
+        is_recordable = "capturable" in self.optimizer.defaults
+        self._recorded = cuda_graph and is_recordable and self._device.type == "cuda"
         self._reported: dict[bool, Collection[str]] = {}
         self._prepare_steps()
         self._counts = {"updates": 0, "owed": 0.0}
