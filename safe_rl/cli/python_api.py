@@ -110,7 +110,7 @@ def resume(
     callbacks: Sequence[Callback] = (),
     **settings: Any,
 ) -> Run:
-    """Continue a run, as ``python train.py resume=…`` does; a finished one stays as it is.
+    """Continue a run, or certify a finished one, as ``python train.py resume=…`` does.
 
     Args:
         directory: Folder of the run.

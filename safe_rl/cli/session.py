@@ -126,13 +126,15 @@ class Session:
         if trainer is None:
             if self.folder.certifying.exists():
                 self._certify()
+            elif not self.folder.certificate.exists():
+                length = int(self.config.env.get("num_steps") or 1000)
+                self._certify_if_long(length, self.config.algo.get("constrained") is not False)
             return
         self._say(outcome)
         if trainer.interrupted_by is not None:
             _print(f"Interrupted. Continue with: {self._again}")
             raise SystemExit(128 + trainer.interrupted_by)
-        if is_to_keep_limits(self.config, bool(trainer.algorithm.cost_keys)):
-            self._certify_if_long(trainer.episode_length)
+        self._certify_if_long(trainer.episode_length, bool(trainer.algorithm.cost_keys))
 
     def refuses(self, error: Exception) -> bool:
         """Whether an error is about settings, files or the environment: the message is enough."""
@@ -230,8 +232,10 @@ class Session:
             with replacing(path) as unfinished:
                 OmegaConf.save(content, unfinished)
 
-    def _certify_if_long(self, episode_length: int) -> None:
+    def _certify_if_long(self, episode_length: int, is_constrained: bool) -> None:
         config = self.config
+        if not is_to_keep_limits(config, is_constrained):
+            return
         # steps of a test that stops early, after a fifth of its episodes
         steps = int(config.get("certificate", {}).get("episodes", 0) * episode_length / 5)
         if 0 < steps <= config.frames:
@@ -250,8 +254,11 @@ class Session:
         try:
             with lock_folder(folder):
                 folder.certifying.touch()
-                threads = self.config.num_threads or 0
-                certificate = certify_run(folder.directory, num_threads=threads)
+                certificate = certify_run(
+                    folder.directory,
+                    num_threads=self.config.num_threads or 0,
+                    changes=self.config.certificate,
+                )
         except KeyboardInterrupt:
             self._say(f"Interrupted before it was certified. To do so: {self._again}")
             raise SystemExit(128 + SIGINT) from None

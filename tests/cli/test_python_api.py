@@ -219,7 +219,7 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
         run.evaluate(variations="dynamics")
 
 
-def test_a_certificate_takes_the_threads_of_its_run(run, monkeypatch):
+def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch):
     given = []
     monkeypatch.setattr(
         "safe_rl.cli.session.certify_run", lambda *said, **options: given.append((*said, options))
@@ -228,7 +228,8 @@ def test_a_certificate_takes_the_threads_of_its_run(run, monkeypatch):
     note.touch()
     safe_rl.resume(run.directory)
     note.unlink()
-    assert given == [(run.directory, {"num_threads": 1})]
+    changes = run.config.certificate
+    assert given == [(run.directory, {"num_threads": 1, "changes": changes})]
 
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():

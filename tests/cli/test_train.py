@@ -1,5 +1,6 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
+import json
 import logging
 import logging.handlers
 import signal
@@ -141,10 +142,14 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     assert written.exists()
     assert not Path("runs/mine/.certifying").exists()
     written.unlink()
-    status, out, _ = command(resume)
-    assert status == 0  # now it is one that is finished
-    assert "40 frames already: raise 'frames' to train on." in out
-    assert not written.exists()
+    # a finished run without a certificate gets one when it is asked for
+    for episodes, is_certified in ((0, False), (100, False), (3, True)):
+        status, out, _ = command(resume, f"certificate.episodes={episodes}")
+        assert status == 0
+        assert "40 frames already: raise 'frames' to train on." in out
+        assert ("fewer than 400, a fifth" in out) == (episodes == 100)
+        assert written.exists() == is_certified
+    assert json.loads(written.read_text())["most_episodes"] == 3
 
 
 def test_an_interruption_is_said_in_a_line_and_ends_by_the_signal():
