@@ -44,6 +44,7 @@ _UNUSED = {
     "then": "It has one update.",
     "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",
     "model.initial_log_std": "Its network gives the standard deviation in every state.",
+    "model.normalise": "Fixed factors, model.input_scale, scale its observations.",
     "preset=paper": "It is the setting of Ray, Achiam, Amodei (2019), none of whose algorithms "
     "has a replay buffer: without it the algorithm has settings of its own.",
 }

@@ -213,17 +213,13 @@ def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
 
 def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
     """Refuse overrides of keys that the algorithm does not read."""
-    algo = config.get("algo") or {}
-    for override in overrides:
-        key = override.key_or_group.replace("/", ".")
-        for unread, reason in unread_by(algo).items():
-            path, _, choice = unread.partition("=")
-            is_chosen = not choice or OmegaConf.select(config, path) == choice
-            if is_chosen and f"{key}.".startswith(f"{path}."):
-                verb = "has no" if choice else "does not read"
-                raise CommandLineError(
-                    f"'{override.input_line}': algo={algo.get('name')} {verb} '{unread}'. {reason}"
-                )
+    for unread, reason in unread_by(plain(config)).items():
+        path, _, choice = unread.partition("=")
+        is_chosen = not choice or OmegaConf.select(config, path) == choice
+        for override in overrides if is_chosen else ():
+            if f"{override.key_or_group.replace('/', '.')}.".startswith(f"{path}."):
+                verb = f"algo={config.algo.get('name')} {'has no' if choice else 'does not read'}"
+                raise CommandLineError(f"'{override.input_line}': {verb} '{unread}'. {reason}")
 
 
 def _check_top(config: DictConfig) -> None:

@@ -207,7 +207,7 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
         own = f": {target} has no such argument. Choose your class by a YAML file ({section}=…)."
         reason = f" without {choice}." if target.startswith("safe_rl.") else own
         return f"there is no key '{key}'{reason}"
-    known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(algo))
+    known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(values))
     read = [path for path in known if path != key and not f"{path}.".startswith(unread)]
     held = [path for path in read if known[path]]
     elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
@@ -217,11 +217,20 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
     return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"
 
 
-def unread_by(algo: Mapping[str, Any]) -> Mapping[str, str]:
-    """Keys and choices (``key=choice``) that an algorithm does not read -> the reasons."""
+def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
+    """Keys and choices (``key=choice``) that a run's algorithm does not read -> the reasons."""
     from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
 
-    return find_recipe(OmegaConf.create({"algo": dict(algo)})).unused_keys
+    algo = values.get("algo") or {}
+    recipe = find_recipe(OmegaConf.create({"algo": algo}))
+    if not recipe.__module__.startswith("safe_rl."):
+        return recipe.unused_keys
+    parts = [part for _, node, part in _nodes(values) if "_target_" in node]
+    has_multiplier = any("multiplier" in (part.names or ()) for part in parts)
+    idle = {} if has_multiplier else {"lagrangian": "Its loss has no multiplier."}
+    if algo.get("constrained") is False:
+        idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits.")
+    return idle | recipe.unused_keys
 
 
 def _nearest_keys(key: str, known: list[str]) -> list[str]:

@@ -102,12 +102,18 @@ def test_only_the_suite_runs_on_mujoco_warp(family, choice):
 
 
 @pytest.mark.parametrize(
-    "override", ["lagrangian=pid", "lagrangian.kp=1", "cost_advantage.gamma=0"]
+    ("algo", "override", "message"),
+    [
+        ("ppo", "lagrangian=pid", "algo=ppo has no 'lagrangian'"),
+        ("ppo", "cost_advantage.gamma=0", "algo=ppo has no 'cost_advantage'"),
+        ("ppo", "+limits=default", r"algo=ppo does not read 'limits'\. It keeps no limits"),
+        ("cpo", "+lagrangian=pi", r"does not read 'lagrangian'\. Its loss has no multiplier"),
+        ("p3o", "+lagrangian=pi", "algo=p3o does not read 'lagrangian'"),
+    ],
 )
-def test_multipliers_go_with_algorithms_that_have_them(override):
-    part = override.partition("=")[0].partition(".")[0]
-    with pytest.raises(CommandLineError, match=f"algo=ppo has no '{part}'"):
-        read_command(["algo=ppo", override])
+def test_limits_and_multipliers_go_with_algorithms_that_have_them(algo, override, message):
+    with pytest.raises(CommandLineError, match=message):
+        read_command([f"algo={algo}", override])
 
 
 def test_a_risk_measure_is_refused_where_no_limit_is_kept():
@@ -126,6 +132,7 @@ UNREAD = {
     "+then.again.loss._target_=safe_rl.objectives.PPOLoss": "'then'. It has one update",
     "model.head=tanh": "'model.head'. The distribution of its actions is the algorithm's own",
     "model.initial_log_std=-1": "Its network gives the standard deviation",
+    "model.normalise=10": r"'model\.normalise'\. Fixed factors, model\.input_scale, scale",
 }
 
 
