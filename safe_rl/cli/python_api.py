@@ -38,6 +38,7 @@ from safe_rl.runs.display import outcome_line
 from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import read_table
+from safe_rl.scores.bounds import rounded_up
 
 if TYPE_CHECKING:
     import pandas
@@ -273,9 +274,11 @@ class Run:
             length = int(config.env.get("num_steps") or 1000)
             lines.append(outcome_line(self.table, dict(config.cost_limits), length))
         if (found := self.certificate) is not None:
-            bounds = ", ".join(f"{name} ≤ {b['bound']:.3g}" for name, b in found["bounds"].items())
-            which = f": {bounds} ({found['checkpoint']})" if found["certified"] else ""
-            lines.append(f"{'C' if which else 'Not c'}ertified at {found['level']:.0%}{which}.")
+            shown = found["bounds"] if found["certified"] else {}
+            bounds = [f"{name} ≤ {rounded_up(b['bound']):.3g}" for name, b in shown.items()]
+            which = f": {', '.join(bounds)} ({found['checkpoint']})" if bounds else ""
+            level = f"{100 * found['level']:.12g}%"  # not rounded up to 100
+            lines.append(f"{'C' if which else 'Not c'}ertified at {level}{which}.")
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

@@ -27,6 +27,7 @@ def make_env(
     num_threads: int = 0,
     transforms: Mapping[str, Any] | None = None,
     evaluating: bool = False,
+    **unknown: Any,
 ) -> ConstrainedEnv:
     """Make a batch of environments of any family.
 
@@ -49,6 +50,12 @@ def make_env(
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
+    if unknown:
+        name = next(iter(unknown))
+        raise TypeError(
+            f"make_env has no argument '{name}'. A key of the environment belongs in its node: "
+            f"make_env({{**env_node('PointGoal1'), '{name}': …}})."
+        )
     env = _named(env) if isinstance(env, str) else env
     target = env.get("_target_") if isinstance(env, Mapping) else None
     build = SafetyGymEnv if target is None else locate(target, key="env._target_")

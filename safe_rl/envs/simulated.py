@@ -120,7 +120,7 @@ class SimulatedEnv(ConstrainedEnv):
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             return
-        require_integer("seed", seed, lowest=-(2**63))
+        require_integer("seed", seed, lowest=0)
         self._row_seed = rng.row_seeds(seed, self.batch_size[0], self._physics.device)
         self._episode.zero_()
 

@@ -22,6 +22,7 @@ from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, replace_json, replacing
 from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
+from safe_rl.scores.bounds import rounded_up
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
 # number of environments that are stepped together, and of episodes between two checks of a test;
@@ -52,7 +53,7 @@ class Certificate:
         level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
         if self.checkpoint is None:
             missing = "; ".join(
-                f"{name} ≤ {bound:.3g}, limit {most:g}, mean {verdict.means[name]:.3g}"
+                f"{name} ≤ {rounded_up(bound):.3g}, limit {most:g}, mean {verdict.means[name]:.3g}"
                 for name, (bound, most) in verdict.bounds.items()
                 if name in verdict.shortfalls
             )
@@ -60,7 +61,8 @@ class Certificate:
                 f"Not certified {level}: no checkpoint's bound is within its limit ({missing}; "
                 f"{verdict.episodes:,} new episodes)."
             )
-        bounds = ", ".join(f"{name} ≤ {b:.3g}" for name, (b, _) in verdict.bounds.items())
+        shown = {name: rounded_up(bound) for name, (bound, _) in verdict.bounds.items()}
+        bounds = ", ".join(f"{name} ≤ {bound:.3g}" for name, bound in shown.items())
         means = ", ".join(f"{mean:.3g}" for mean in verdict.means.values())
         return (
             f"Certified {level}: {bounds} ({means} in {verdict.episodes:,} new episodes), return "

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import inf
+from math import inf, nan
 from typing import Any
 
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval
+from safe_rl.scores.bounds import rounded_up
 
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
@@ -119,5 +120,6 @@ def certificate_table(experiments: Sequence[Experiment]) -> Table:
         "episodes": "{episodes:d}",
     }
     rows = each_cost(records, _names(records, "bound_"), bound="bound_{}", most="most_{}")
+    rows = [{**row, "bound": rounded_up(row.get("bound", nan), 4)} for row in rows]
     marks = {"certified": lambda row: "bad" if row["certified"] == "no" else ""}
     return Table("certificates", "Certificates", columns, records, shown=rows, marks=marks)

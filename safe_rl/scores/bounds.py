@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import ROUND_CEILING, Context
 
 import numpy as np
 import scipy  # its parts are loaded on first use, which takes half a second
@@ -12,6 +13,16 @@ from numpy.typing import ArrayLike
 # episode's highest cost is usually far above the limit, and then large bets are the best ones
 _BETS = np.array([0.99, 0.7, 0.4, 0.2, 0.08, 0.03])
 _WEIGHTS = np.array([4, 2, 1, 1, 1, 1]) / 10
+
+
+def rounded_up(bound: float, digits: int = 3) -> float:
+    """An upper bound with fewer significant digits, which is shown no lower than it is.
+
+    Examples:
+        >>> [f"{rounded_up(bound):.3g}" for bound in (25.04, 25.1, 0.01234)]
+        ['25.1', '25.1', '0.0124']
+    """
+    return float(Context(digits, ROUND_CEILING).create_decimal(repr(float(bound))))
 
 
 def _growth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:

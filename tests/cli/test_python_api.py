@@ -1,6 +1,7 @@
 """The way in from Python does what the commands do, whatever state Hydra is in."""
 
 import csv
+import json
 import math
 import shutil
 import signal
@@ -309,6 +310,10 @@ def test_a_run_shows_itself(tmp_path):
     page = run._repr_html_()
     assert page.startswith("<pre>Run(&#x27;")
     assert 'src="data:image/png;base64,' in page
+    told = {"certified": True, "checkpoint": "c", "level": 0.9995}
+    told["bounds"] = {"mean_cost": {"bound": 25.04}}
+    (tmp_path / "run" / "certificate.json").write_text(json.dumps(told))
+    assert repr(run).endswith("\nCertified at 99.95%: mean_cost ≤ 25.1 (c).")
     assert "episode_return" in str(safe_rl.evaluate(run, episodes=2))
     assert safe_rl.report(tmp_path, archive=f"{tmp_path}_kept").is_file()
     assert tmp_path.with_name(f"{tmp_path.name}_kept").is_dir()

@@ -65,6 +65,18 @@ def test_names_of_families_and_of_2019_are_known():
 
 
 @pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"hazards_num": 3}, r"no argument 'hazards_num'\. .*env_node\('PointGoal1'\), 'hazards_n"),
+        ({"seed": -1}, "'seed' must be an integer of at least 0"),
+    ],
+)
+def test_wrong_arguments_are_told(wrong, message):
+    with pytest.raises((TypeError, ConfigError), match=message):
+        make_env("PointGoal1", **wrong)
+
+
+@pytest.mark.parametrize(
     ("name", "nearest"),
     [
         ("PointGaol1", "PointGoal1"),

@@ -199,8 +199,8 @@ def test_levels_are_not_rounded(level, shown):
 
 
 def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
-    bounds, means = {"mean_cost": (10.87, 5.0), "mean_fast": (1.0, 2.0)}, {"mean_cost": 4.0}
-    verdict = Verdict(None, [0], bounds, {"mean_cost": 5.87}, means, {}, 20)
+    bounds, means = {"mean_cost": (10.82, 5.0), "mean_fast": (1.0, 2.0)}, {"mean_cost": 4.0}
+    verdict = Verdict(None, [0], bounds, {"mean_cost": 5.82}, means, {}, 20)
     shown = str(Certificate(None, math.nan, verdict, OPTIONS))
     assert shown.endswith("(mean_cost ≤ 10.9, limit 5, mean 4; 20 new episodes).")
 

@@ -33,7 +33,7 @@ def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
     other = write_run(tmp_path, algo="p3o", **EPOCHS)
     none = certificate(
         certified=False, checkpoint=None, episode_return=None,
-        bounds={"mean_cost": {"bound": 31.6566, "most": 25.0}},
+        bounds={"mean_cost": {"bound": 31.6512, "most": 25.0}},
     )  # fmt: skip
     (other / "certificate.json").write_text(json.dumps(none))
     write_run(tmp_path, algo="ppo", **EPOCHS)  # has none, and is not spoken of
@@ -46,5 +46,5 @@ def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
         rows = list(csv.DictReader(file))
     assert {row["algorithm"]: row["bound_mean_cost"] for row in rows} == {
         "CPO": "19.7252",
-        next(row["algorithm"] for row in rows if row["algorithm"] != "CPO"): "31.6566",
+        next(row["algorithm"] for row in rows if row["algorithm"] != "CPO"): "31.6512",
     }
