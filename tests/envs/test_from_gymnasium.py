@@ -59,7 +59,7 @@ def test_a_cost_that_no_info_has_is_told_after_an_episode():
     env = from_gymnasium(make_pendulum, num_envs=2, num_steps=5, cost_keys=keys, seed=0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        env.rollout(5)
+        env.rollout(4)
     told = r"'cost_power' is in no info of the first 5 steps.*infos have cost_speed, torque"
     with pytest.warns(UserWarning, match=told) as caught:
         step = env.rollout(20, break_when_any_done=False)["next"]
@@ -166,6 +166,7 @@ def test_a_copy_continues_as_the_original_does(copied):
         (Counter, {"num_env": 2}, "'num_env' is for gymnasium.make.*Did you mean 'num_envs'"),
         (Counter, {"cost_keys": "cost"}, r"'cost_keys' must be a list.*\['cost'\]"),
         (Counter, {"num_envs": 0}, "'num_envs' must be an integer of at least 1"),
+        (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*by flatten=False only"),
         (Counter, {"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
     ],
 )

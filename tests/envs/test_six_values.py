@@ -1,6 +1,7 @@
 """Environments whose step returns six values: by id, and from a function."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium
@@ -8,7 +9,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, from_six_values, make_env
+from safe_rl.envs import ConfigError, from_gymnasium, from_six_values, make_env
 
 NODE = {
     "_target_": "safe_rl.envs.gymnasium.make_safety_gymnasium",
@@ -67,7 +68,11 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**NODE, **keys})
 
 
-def test_a_missing_package_and_five_values_are_said(monkeypatch):
+def test_a_missing_package_and_another_number_of_values_are_said(monkeypatch, package):
+    ice = partial(package.make, "SafetyIce1-v0")
+    for keys in ({}, {"cost_keys": ["cost"]}):
+        with pytest.raises(ValueError, match=r"returned 6 values.*use from_six_values"):
+            from_gymnasium(ice, num_steps=5, **keys).rollout(2)
     monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
     with pytest.raises(ConfigError, match=r"cannot be imported.*from_six_values"):
         make_env(NODE)

@@ -35,7 +35,7 @@ def make_adapted(
 
     Episodes are truncated after `num_steps`. With `flatten`, observations are float32 vectors.
     """
-    env = make()
+    env = FloatCosts(make(), cost_keys)
     seen, actions = env.observation_space, env.action_space
     # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled.
     if flatten:
@@ -46,7 +46,7 @@ def make_adapted(
             Discrete(actions.n) if isinstance(actions, Discrete) else MultiDiscrete(actions.nvec)
         )
         env = TransformAction(env, partial(np.add, actions.start), choices)
-    return FloatCosts(TimeLimit(env, num_steps), cost_keys)
+    return TimeLimit(env, num_steps)
 
 
 def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
@@ -65,8 +65,14 @@ class FloatCosts(gymnasium.Wrapper):
         self._cost_keys = list(cost_keys)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert the costs."""
+        """Step, and convert the costs; ValueError unless the environment returns five values."""
         *values, info = self.env.step(action)
+        if len(values) != 4:
+            raise ValueError(
+                f"A step of {self.env} returned {len(values) + 1} values instead of five "
+                "(observation, reward, terminated, truncated, info). For an environment that "
+                "returns its cost as one of six values, use from_six_values."
+            )
         costs = {key: info[key] for key in self._cost_keys if key in info}
         for key, cost in costs.items():
             try:
@@ -124,7 +130,7 @@ class CostReader(BaseInfoDictReader):
         self._names |= {name for name in info_dict if not name.startswith("_")}
         self._unseen -= self._names
         self._num_steps += 1
-        if self._num_steps <= self._patience:
+        if self._num_steps < self._patience:
             return
         for key in sorted(self._unseen):
             others = sorted(self._names.difference(self._cost_keys))
