@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -40,12 +41,15 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
                 f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
                 "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."
             )
-        random_steps = setting(config, "exploration.random_steps")
+        n = config.memory.get("n_steps", 1)  # the last n of a row wait for their n-step returns
+        waiting = 0 if n == 1 else n * env.batch_size.numel() * env.steps_per_decision
+        begin = setting(config, "exploration.random_steps") + waiting
+        frames = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
         warning = (
-            f"Nothing will be learned: exploration.random_steps={random_steps} come first, and the "
-            f"run has {config.frames:,}."
+            f"Nothing will be learned: the run has {frames:,} steps, and learning begins after "
+            f"{begin:,} (exploration.random_steps, memory.n_steps)."
         )
-        return warning if config.frames < random_steps else "", True
+        return warning if frames < begin else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
     learns_from = _fill(buffer, node, limits, env, bounded_actions(env))
     return learns_from + _other_environment(config), not node.alone
