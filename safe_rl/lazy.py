@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 
@@ -22,6 +23,14 @@ def import_later(
         homes: Module, named from the package -> names that it defines.
     """
     modules = {name: f"{package}.{home}" for home, names in homes.items() for name in names}
+
+    class Package(ModuleType):
+        def __setattr__(self, name: str, value: Any) -> None:
+            # a module, such as safe_rl.evaluate, does not take the place of a function
+            if not (name in modules and isinstance(value, ModuleType)):
+                super().__setattr__(name, value)
+
+    sys.modules[package].__class__ = Package
 
     def find(name: str) -> Any:
         if name not in modules:

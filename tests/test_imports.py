@@ -7,6 +7,8 @@ import pytest
 from commands import ROOT, in_a_process
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
+import safe_rl
+
 LAZY = ["safe_rl", "safe_rl.envs", "safe_rl.envs.gymnasium", "safe_rl.envs.velocity"]
 
 
@@ -29,6 +31,12 @@ def test_the_package_itself_imports_what_comes_before_torch_and_no_part():
 def test_what_is_imported_later_is_listed_at_once(package):
     module = import_module(package)
     assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
+
+
+@pytest.mark.parametrize("name", ["evaluate", "report"])
+def test_a_function_keeps_its_name_when_the_module_of_that_name_is_imported(name):
+    assert import_module(f"safe_rl.{name}").main
+    assert getattr(safe_rl, name) is getattr(import_module("safe_rl.cli.python_api"), name)
 
 
 def test_the_package_is_imported_in_no_time_and_says_what_it_has_without_torch():

@@ -53,12 +53,7 @@ def parse(text: str) -> Override:
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split words into the values of all ``name=value``, and the other words.
-
-    Examples:
-        >>> take_word("slate", ["slate=SG6", "seed=0"])
-        (['SG6'], ['seed=0'])
-    """
+    """Split words into the values of all ``name=value``, and the other words."""
     given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
     others = [word for word in words if word not in given]
     return [word.partition("=")[2] for word in given], others
@@ -69,10 +64,6 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
 
     Returns:
         The modules, or None if ``import=`` is not given; and the other arguments.
-
-    Examples:
-        >>> split_imports(["import=mine", "seed=1", "import=[examples/other.py]"])
-        (['mine', 'examples/other.py'], ['seed=1'])
     """
     given, others = take_word(IMPORT, arguments)
     modules: list[str] = []

@@ -225,8 +225,11 @@ def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
     recipe = find_recipe(OmegaConf.create({"algo": algo}))
     if not recipe.__module__.startswith("safe_rl."):
         return recipe.unused_keys
-    parts = [part for _, node, part in _nodes(values) if "_target_" in node]
-    has_multiplier = any("multiplier" in (part.names or ()) for part in parts)
+    has_multiplier = any(
+        "multiplier" in (part.names or ()) or not str(node["_target_"]).startswith("safe_rl.")
+        for path, node, part in _nodes(values)
+        if path.split(".")[-1] in ("loss", "policy_update") and "_target_" in node
+    )
     idle = {} if has_multiplier else {"lagrangian": "Its loss has no multiplier."}
     if algo.get("constrained") is False:
         idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits.")
@@ -255,11 +258,7 @@ def _choice_with(key: str) -> str | None:
 
 
 def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
-    """Full keys of a configuration, and of further settings that its parts would read.
-
-    Yields:
-        A key, and whether the configuration holds it.
-    """
+    """Full keys that parts of a configuration would read, and whether it holds them."""
     for path, node, part in _nodes(values):
         if not path.startswith((*GIVEN_WHOLE, "default_cost_limits", "paper")):
             settings = part.settings if "_target_" in node else {}
@@ -270,11 +269,7 @@ def _keys_of(values: Mapping[str, Any]) -> Iterator[tuple[str, bool]]:
 def _nodes(
     values: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, Mapping[str, Any], Part]]:
-    """The mappings of a configuration, each before those within it.
-
-    Yields:
-        The full key of a mapping, the mapping, and which keys it may have.
-    """
+    """Full key, mapping and allowed keys of each mapping, before those within it."""
     target = values.get("_target_")
     if path == "env":
         yield path, values, Part({"name": KEYS["env.name"]}, None)

@@ -254,11 +254,8 @@ class Session:
         try:
             with lock_folder(folder):
                 folder.certifying.touch()
-                certificate = certify_run(
-                    folder.directory,
-                    num_threads=self.config.num_threads or 0,
-                    changes=self.config.certificate,
-                )
+                threads, changes = self.config.num_threads or 0, self.config.certificate
+                certificate = certify_run(folder.directory, num_threads=threads, changes=changes)
         except KeyboardInterrupt:
             self._say(f"Interrupted before it was certified. To do so: {self._again}")
             raise SystemExit(128 + SIGINT) from None

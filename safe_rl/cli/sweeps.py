@@ -27,12 +27,7 @@ _GRACE = 30.0
 
 
 def count_jobs(overrides: Sequence[str]) -> int:
-    """Number of jobs that overrides make.
-
-    Examples:
-        >>> count_jobs(["env=PointGoal1,CarGoal1", "seed=0,10,20", "algo=cpo"])
-        6
-    """
+    """Number of jobs that overrides make."""
     swept = (override for override in map(parse, overrides) if override.is_discrete_sweep())
     return math.prod(len(list(override.sweep_string_iterator())) for override in swept)
 

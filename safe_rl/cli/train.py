@@ -149,12 +149,7 @@ def _parser() -> ArgumentParser:
 
 
 def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
-    """Replace ``slate=SG6`` by the slate's environments (Ray, Achiam, Amodei 2019, section 5.1).
-
-    Examples:
-        >>> expand_slate(["slate=SGDoggo", "seed=0"], is_sweep=True)[0]
-        'env=DoggoGoal1,DoggoGoal2,DoggoButton1,DoggoButton2,DoggoPush1,DoggoPush2'
-    """
+    """Replace ``slate=SG6`` by the slate's environments (Ray, Achiam, Amodei 2019, section 5.1)."""
     given, others = take_word("slate", words)
     if not given:
         return others

@@ -21,12 +21,7 @@ _imported: list[str] = []
 
 
 def note_imports(modules: str | Sequence[str] | None) -> list[str]:
-    """The override that writes modules into a run's configuration; an empty list for None.
-
-    Examples:
-        >>> note_imports(["mine", "examples/other.py"])
-        ["++import=['mine','examples/other.py']"]
-    """
+    """The override that writes modules into a run's configuration; an empty list for None."""
     if modules is None:
         return []
     listed = list(modules) if isinstance(modules, list | tuple) else [modules]

@@ -10,12 +10,7 @@ class ConfigError(ValueError):
 
 
 def on_cpu_only(key: str) -> str:
-    """Return a hint that only Safety Gym has a key of MuJoCo Warp; an empty text for other keys.
-
-    Examples:
-        >>> on_cpu_only("frame_skip")
-        ''
-    """
+    """Return a hint that only Safety Gym has a key of MuJoCo Warp; an empty text for other keys."""
     if key not in ("physics", "physics_buffers"):
         return ""
     return (

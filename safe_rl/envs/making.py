@@ -40,6 +40,7 @@ def make_env(
         num_threads: Largest number of threads that step them; 0 for one per core.
         transforms: Name -> transform, or its node, as `transform_env` takes them.
         evaluating: Whether transforms that only serve learning are undone.
+        unknown: Any other argument is refused; keys of the environment belong in `env`.
 
     Raises:
         ConfigError: For an unknown name or key, or a value that cannot be used.

@@ -59,14 +59,7 @@ class SimulatedEnv(ConstrainedEnv):
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
     ) -> None:
-        """Set the specs and the first seed, after everything else is built.
-
-        Args:
-            model: The compiled model, whose actuators are controlled.
-            observation: Spec of the observation of N worlds.
-            highest: Largest cost of a step.
-            seed: Seed of the environment; None takes one from torch's generator.
-        """
+        """Set the specs and the seed at the end; ``highest`` is the largest cost of a step."""
         physics = self._physics
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
         self._has_cost = torch.zeros_like(self._episode, dtype=torch.bool)

@@ -13,24 +13,13 @@ from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
 
-def test_values_are_read_with_their_types():
-    options = parse_options(
-        ["episodes=1_000", "video=true", "seed=3", "env.layout_seeds_first=7", "env.goal_size=0.4"],
-        EvaluationOptions,
+def test_values_are_read_with_their_types_and_mappings_without_spaces_too():
+    given = ["episodes=1_000", "video=true", "seed=3", "env.goal_size=0.4"]
+    given += ["cost_limits={cost:20,cost_hazards: 5}", "env.kwargs={a:{b:1.5},c:[1,2]}"]
+    env, limits = {"goal_size": 0.4, "kwargs": {"a": {"b": 1.5}, "c": [1, 2]}}, {"cost": 20.0}
+    assert parse_options(given, EvaluationOptions) == EvaluationOptions(
+        episodes=1000, video=True, seed=3, env=env, cost_limits={**limits, "cost_hazards": 5.0}
     )
-    assert options == EvaluationOptions(
-        episodes=1000, video=True, seed=3, env={"layout_seeds_first": 7, "goal_size": 0.4}
-    )
-
-
-def test_mappings_are_read_as_training_reads_them():
-    """Without spaces, too: YAML alone makes a name without a value of that."""
-    options = parse_options(
-        ["cost_limits={cost:20,cost_hazards: 5}", "env.kwargs={a:{b:1.5},c:[1,2]}"],
-        EvaluationOptions,
-    )
-    assert options.cost_limits == {"cost": 20.0, "cost_hazards": 5.0}
-    assert options.env == {"kwargs": {"a": {"b": 1.5}, "c": [1, 2]}}
 
 
 @pytest.mark.parametrize("name", ["off", "yes", "007", "1e3", "2.50", "'a b'", "x=y"])

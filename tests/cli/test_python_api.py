@@ -332,9 +332,3 @@ def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
     assert seen == run.table["steps"] == [40, 80]
     run = safe_rl.resume(tmp_path, frames=400, callbacks=[lambda row: row["steps"] < 120])
     assert run.table["steps"] == [40, 80, 120]
-
-
-def test_the_package_lists_what_it_offers():
-    names = {name for name in dir(safe_rl) if not name.startswith("__")}
-    assert names == {"Run", "evaluate", "load", "make_env", "report", "resume", "train"}
-    assert safe_rl.make_env("PointGoal1", num_envs=2, seed=0).batch_size == torch.Size([2])

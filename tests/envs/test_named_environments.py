@@ -62,18 +62,12 @@ def test_names_of_families_and_of_2019_are_known():
     assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"
     with pytest.raises(ConfigError, match="'PointGoal1' is a built-in environment"):
         store_config("PointGoal1", {"hazards_num": 3})  # make_env would make the built-in one
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"hazards_num": 3}, r"no argument 'hazards_num'\. .*env_node\('PointGoal1'\), 'hazards_n"),
-        ({"seed": -1}, "'seed' must be an integer of at least 0"),
-    ],
-)
-def test_wrong_arguments_are_told(wrong, message):
-    with pytest.raises((TypeError, ConfigError), match=message):
-        make_env("PointGoal1", **wrong)
+    with pytest.raises(
+        TypeError, match=r"no argument 'hazards_num'\. .*'PointGoal1'\), 'hazards_n"
+    ):
+        make_env("PointGoal1", hazards_num=3)
+    with pytest.raises(ConfigError, match="'seed' must be an integer of at least 0"):
+        make_env("PointGoal1", seed=-1)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from safe_rl.evaluation.variations import Variation, varied
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["epsiodes=3"], "Did you mean 'episodes'?"),
         (["env.hazard_num=3"], "hazards_num"),
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8"], "trained on other observations"),
@@ -37,7 +36,6 @@ from safe_rl.evaluation.variations import Variation, varied
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
         (["certify=true", "env.hazards_num=3"], "env: it is ignored by certify=true"),
         (["certificate.episodes=9"], "add certify=true"),
-        (["certify=true", "certificate.episode=9"], "Did you mean 'episodes'?"),
         (["env.hazards_num=200", "episodes=1"], "hazards"),
     ],
 )
@@ -96,11 +94,6 @@ def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, m
     monkeypatch.setattr("safe_rl.cli.run_folders.envs.make_env", make)
     assert main([str(run)]) == 1
     assert "error: mine was asked for 25" in capsys.readouterr().err
-
-
-def test_a_folder_above_runs_names_them(run, capsys):
-    assert main([str(run.parent)]) == 1
-    assert f"Runs below it: {run}" in capsys.readouterr().err
 
 
 def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):

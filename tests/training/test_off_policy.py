@@ -90,13 +90,13 @@ def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
     assert "Nothing will be learned" in resumed.algorithm.learns_from
     assert "when it holds 321 new ones" in resumed.algorithm.lost_on_resume
     assert make_trainer("longer", *short, "frames=480").algorithm.learns_from == ""
-    equal = ("frames=320", "exploration.random_steps=320")
-    for steps in (1, 3):  # the last three steps are not in the replay buffer
-        trainer = make_trainer(f"equal{steps}", *short, *equal, f"memory.n_steps={steps}")
-        assert bool(trainer.algorithm.learns_from) == (steps == 3)
+    equal = (*short, "frames=320", "exploration.random_steps=320")
+    for steps, nothing in ((1, False), (3, True)):  # the last steps wait for their n-step returns
+        trainer = make_trainer(f"equal{steps}", *equal, f"memory.n_steps={steps}")
+        assert bool(trainer.algorithm.learns_from) == nothing
         trainer.run()
         table = read_table(trainer.record.folder.table)
-        assert (table["policy_num_updates"][-1] == 0) == (steps == 3)
+        assert (table["policy_num_updates"][-1] == 0) == nothing
 
 
 def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):

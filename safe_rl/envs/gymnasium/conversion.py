@@ -15,13 +15,7 @@ from torchrl.envs import GymWrapper
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, require_integer
 from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import (
-    CostReader,
-    FloatCosts,
-    GymnasiumEnv,
-    SixValues,
-    make_adapted,
-)
+from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
@@ -239,9 +233,10 @@ def _checked(make: MakeEnv) -> gymnasium.Env:
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
-    probe.action_space.seed(0)
-    probe.reset(seed=0)
-    *_, info = FloatCosts(probe, []).step(probe.action_space.sample())
+    adapted = make_adapted(lambda: probe, 1, False, [])  # it checks the number of values
+    adapted.action_space.seed(0)
+    adapted.reset(seed=0)
+    *_, info = adapted.step(adapted.action_space.sample())
     return [key for key in info if is_cost(key)]
 
 

@@ -69,9 +69,8 @@ class FloatCosts(gymnasium.Wrapper):
         *values, info = self.env.step(action)
         if len(values) != 4:
             raise ValueError(
-                f"A step of {self.env} returned {len(values) + 1} values instead of five "
-                "(observation, reward, terminated, truncated, info). For an environment that "
-                "returns its cost as one of six values, use from_six_values."
+                f"A step of {self.env} returned {len(values) + 1} values instead of five. If its "
+                "cost is one of six values, use from_six_values."
             )
         costs = {key: info[key] for key in self._cost_keys if key in info}
         for key, cost in costs.items():
