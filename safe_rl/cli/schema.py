@@ -232,8 +232,8 @@ def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
     )
     idle = {} if has_multiplier else {"lagrangian": "Its loss has no multiplier."}
     if algo.get("constrained") is False:
-        idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits.")
-    return idle | recipe.unused_keys
+        idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits, unlike cpo.")
+    return {**idle, **recipe.unused_keys}
 
 
 def _nearest_keys(key: str, known: list[str]) -> list[str]:

@@ -35,7 +35,7 @@ def make_adapted(
 
     Episodes are truncated after `num_steps`. With `flatten`, observations are float32 vectors.
     """
-    env = FloatCosts(make(), cost_keys)
+    env: gymnasium.Env = FloatCosts(make(), cost_keys)
     seen, actions = env.observation_space, env.action_space
     # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled.
     if flatten:
