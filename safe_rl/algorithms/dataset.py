@@ -30,7 +30,9 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
         or an empty text; and whether transitions that the run collects are added to the buffer.
 
     Raises:
-        ValueError: If the dataset is missing, does not fit, or is not finite.
+        ValueError: If ``dataset.alone`` is true without a path; if transitions do not fit the
+            environment, lack an entry or are not finite; if no episode is within the limits, or
+            the replay buffer is too small.
     """
     node = config.get("dataset")
     if node is None or node.path is None:

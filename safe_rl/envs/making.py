@@ -27,7 +27,6 @@ def make_env(
     num_threads: int = 0,
     transforms: Mapping[str, Any] | None = None,
     evaluating: bool = False,
-    **unknown: Any,
 ) -> ConstrainedEnv:
     """Make a batch of environments of any family.
 
@@ -40,7 +39,6 @@ def make_env(
         num_threads: Largest number of threads that step them; 0 for one per core.
         transforms: Name -> transform, or its node, as `transform_env` takes them.
         evaluating: Whether transforms that only serve learning are undone.
-        unknown: Any other argument is refused; keys of the environment belong in `env`.
 
     Raises:
         ConfigError: For an unknown name or key, or a value that cannot be used.
@@ -51,12 +49,6 @@ def make_env(
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
-    if unknown:
-        name = next(iter(unknown))
-        raise TypeError(
-            f"make_env has no argument '{name}'. A key of the environment belongs in its node: "
-            f"make_env({{**env_node('PointGoal1'), '{name}': …}})."
-        )
     env = _named(env) if isinstance(env, str) else env
     target = env.get("_target_") if isinstance(env, Mapping) else None
     build = SafetyGymEnv if target is None else locate(target, key="env._target_")
