@@ -1,7 +1,6 @@
 """How often both bounds give certificates, and how often these are wrong, in a simulation.
 
-    python benchmarks/certificate_validity.py [repetitions=1000] [episodes=3000] [means=25,22,20,18]
-        [costs=FILE.csv] [write=FILE.csv]
+    python benchmarks/certificate_validity.py --repetitions 500 --means 25 --write FILE.csv
 
 Policies with known mean costs are tested by `safe_rl.scores.certificate.first_certified`, three
 candidates of a run on the same layouts. If the mean is exactly the limit, 25, every certificate is
@@ -9,14 +8,14 @@ wrong, and at most 5 % of the runs may get one. If the mean is below the limit, 
 with a certificate is the power of the test. Both bounds get the same number of episodes; betting
 may stop earlier. Realistic costs are resampled from `episode_costs.csv` and scaled to the mean.
 This file has 1,000 episodes of the policy `certified/PointGoal1` (`python -m safe_rl.evaluate
-certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0). `costs=` names
+certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0). `--costs` names
 another CSV file, with a column per policy and a row per episode.
 """
 
 from __future__ import annotations
 
+import argparse
 import csv
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -104,33 +103,35 @@ def is_certified(draw: Draw, bound: str, number: int, rng: np.random.Generator) 
     return verdict.certified is not None, sum(used)
 
 
-def main(
-    repetitions: str = "1000",
-    episodes: str = "3000",
-    means: str = "25,22,20,18",
-    costs: str = str(COSTS),
-    write: str = "",
-) -> None:
-    rows = []
-    own = measured(Path(costs))
-    for mean in map(float, means.split(",")):
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repetitions", type=int, default=1000)
+    parser.add_argument("--episodes", type=int, default=3000)
+    parser.add_argument("--means", type=float, nargs="+", default=[25, 22, 20, 18])
+    parser.add_argument("--costs", type=Path, default=COSTS)
+    parser.add_argument("--write", type=Path, help="a CSV file for the table")
+    options = parser.parse_args()
+    own, rows = measured(options.costs), []
+    print("mean", "costs", "betting", "episodes", "student", "episodes", sep="\t")
+    for mean in options.means:
         for name, draw in distributions(mean, own):
             row = {"mean": mean, "costs": name}
             for bound in ("betting", "student"):
                 rng = np.random.default_rng(1)
                 found = [
-                    is_certified(draw, bound, int(episodes), rng) for _ in range(int(repetitions))
+                    is_certified(draw, bound, options.episodes, rng)
+                    for _ in range(options.repetitions)
                 ]
                 row[bound] = round(float(np.mean([certified for certified, _ in found])), 4)
                 row[f"{bound}_episodes"] = int(np.median([used for _, used in found]))
             rows.append(row)
             print(*row.values(), sep="\t", flush=True)
-    if write:
-        with Path(write).open("w", newline="") as file:
+    if options.write:
+        with options.write.open("w", newline="") as file:
             table = csv.DictWriter(file, list(rows[0]))
             table.writeheader()
             table.writerows(rows)
 
 
 if __name__ == "__main__":
-    main(**dict(argument.split("=", 1) for argument in sys.argv[1:]))
+    main()

@@ -1,10 +1,10 @@
 """How much of the gain of a policy step on its own batch is also a gain on other batches.
 
-Batches are collected with the policy of a run's last checkpoint. A TRPO step is taken on each of
-them, and its surrogate gain is computed on this batch and on all others. A gain that occurs only
-on its own batch is noise of the advantages. The size of the noise depends on λ_GAE, most of all
-for the costs. How much of it a step follows depends on the number of conjugate gradient
-iterations.
+Batches are collected with the policy of the last checkpoint of a run, whose algorithm has to be
+on-policy and constrained. A TRPO step is taken on each of them, and its surrogate gain is computed
+on this batch and on all others. A gain that occurs only on its own batch is noise of the
+advantages. The size of the noise depends on λ_GAE, most of all for the costs. How much of it a step
+follows depends on the number of conjugate gradient iterations.
 
     python benchmarks/held_out_gain.py RUN_DIR --lmbda 0.97,0.97 0.95,0.9 --cg-iterations 3 5 10
 
@@ -128,7 +128,7 @@ def main():
         batches = [estimated(algorithm, batch, lmbdas) for batch in collected]
         cells = []
         for value in options.multipliers:
-            fixed = LagrangeMultiplier(limits, init=max(value, 1e-6), lr=0.0)
+            fixed = LagrangeMultiplier(limits, init=max(value, 1e-6), lr=1.0)  # not updated
             own, others = gains(algorithm, batches, references, fixed, number)
             error = statistics.stdev(others) / math.sqrt(len(others))
             cells.append(

@@ -56,7 +56,7 @@ def measure(config, epochs, directory):
     trainer = build_trainer(config, new_env(config), directory)
     batches = trainer.batches()
     env = new_env(config)
-    num_steps = config.frames_per_batch // config.num_envs
+    num_steps = config.frames_per_batch // (config.num_envs * env.steps_per_decision)
     rows = []
     for _ in range(epochs + 1):
         rows.append(trainer.epoch(batches) | {"time_env": env_seconds(env, num_steps)})
