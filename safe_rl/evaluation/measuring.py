@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -193,7 +193,7 @@ def evaluate(
     films = [run.evaluation(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
     kept = [run.evaluation(options.name, "transitions")] if options.record else []
-    check_places([summary, table, *films])
+    check_places(directory, [summary, table, *films])
     for film in films:
         with closing(trial.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
@@ -217,10 +217,9 @@ def evaluate(
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
 
 
-def check_places(places: Collection[Path]) -> None:
-    """Refuse files that cannot be written, before any episode."""
-    for folder in {place.parent for place in places}:
-        check_no_links(folder)
+def check_places(directory: Path, places: Iterable[Path]) -> None:
+    """Refuse a run's folder that holds links, and files that cannot be written."""
+    check_no_links(directory)
     for place in places:
         check_place(place, "A run's evaluations lie in its folder: evaluate a copy of that.")
 

@@ -226,7 +226,7 @@ def evaluate_variations(
     config.env = override_env(config, options.env)
     checkpoint = find_checkpoint(directory, options.checkpoint)
     file, picture = (RunFolder(directory).variations(options.name, kind) for kind in ("csv", "png"))
-    check_places([file, picture])
+    check_places(directory, [file, picture])
     for variation in variations:  # wrong keys and layouts are found before the first episode
         if not variation.may_lack and (changed := varied(config, variation)) is not None:
             env = Trial(changed, checkpoint, options, make_env).make(num_envs=1)

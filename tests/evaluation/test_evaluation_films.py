@@ -81,6 +81,7 @@ def test_what_an_evaluation_records_is_what_it_measured(run):
 def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
     skip_without_opengl()
     film, path = FORMATS[suffix], tmp_path / f"episode.{suffix}"
+    (tmp_path / "python").symlink_to(run)  # outside of the run's folder links may lie beside it
     found = [
         evaluate(run, options(episodes=2, picture=str(path), **extra))
         for extra in ({}, {"camera": "fixedfar"})
