@@ -79,7 +79,7 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         groups.setdefault((e.environment, e.planned_steps), []).append(e)
     rows = [(*group, key) for group, own in groups.items() for key in drawn_keys(own)]
     figure = Figure(figsize=(WIDTH, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
-    panels = figure.subplots(len(rows), 3, squeeze=False)
+    panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
     several = len({name for name, _ in groups}) < len(groups)
     for (environment, steps, key), axes in zip(rows, panels, strict=True):
         shown = groups[environment, steps]
@@ -96,7 +96,7 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         axis.set_title(title, fontweight="bold")
     for axis in panels[-1]:
         axis.set_xlabel("environment steps")
-    add_legend(figure, panels[:, 0])
+    add_legend(figure, panels.ravel())
     return figure
 
 

@@ -20,9 +20,10 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
         write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=costs)
     write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
               env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
+    write_run(tmp_path, "PointPush1", "trpo", returns=[np.nan], costs=[np.nan], rates=[3])
     experiments = experiments_in(tmp_path)
     figure = draw_learning_curves(experiments, algorithm_styles(experiments))
-    panels = np.array(figure.axes).reshape(2, 3)
+    panels = np.array(figure.axes).reshape(3, 3)
     assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
     assert panels[0, 0].get_ylabel() == "PointGoal1"
     cost_line, limit = panels[0, 1].lines
@@ -32,10 +33,12 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     assert (band.ymin, band.ymax) == pytest.approx((30.0, 36.0))
     assert list(panels[0, 2].lines[-1].get_ydata()) == [0.025, 0.025]
     # the limit of another task, over shorter episodes; and a run that is not finished is dotted
-    assert list(panels[1, 2].lines[-1].get_ydata()) == [0.02, 0.02]
-    assert panels[1, 0].lines[0].get_linestyle() == ":"
+    assert list(panels[2, 2].lines[-1].get_ydata()) == [0.02, 0.02]
+    assert panels[2, 0].lines[0].get_linestyle() == ":"
+    # where no episode has ended, the cost rate alone gives the name and the steps
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["PPO", "CPO (unfinished)"]
+    assert names == ["PPO", "TRPO", "CPO (unfinished)"]
+    assert panels[1, 0].get_xlim() == panels[1, 2].get_xlim()
 
 
 def test_every_limited_cost_has_a_row(tmp_path):
