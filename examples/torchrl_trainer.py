@@ -130,7 +130,7 @@ TRAINERS = {"ppo_lagrangian": ppo_lagrangian_trainer, "cpo": cpo_trainer}
 
 
 def main(arguments: list[str] | None = None) -> Trainer:
-    """Train, print a line per batch in which episodes ended, and return the trainer."""
+    """Train, print a line per batch, and return the trainer."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--algo", choices=TRAINERS, default="ppo_lagrangian")
     parser.add_argument("--env", default="PointGoal1")
