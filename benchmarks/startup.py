@@ -26,8 +26,7 @@ import safe_rl.envs
 print(theirs - start, time.perf_counter() - theirs)
 """
 FIRST_STEP = """
-import runpy, time
-import safe_rl.envs
+import runpy, time, safe_rl.envs
 from torchrl.envs import EnvBase
 step = EnvBase.step
 def first_step(env, tensordict):

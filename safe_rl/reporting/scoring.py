@@ -60,8 +60,9 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _published(experiment: Experiment) -> dict[str, Any]:
-    """Published values for the same environment and algorithm."""
-    if experiment.is_continued or not experiment.has_published_limit:
+    """Published values for the same environment, which no transform changes, and algorithm."""
+    changed = any(run.config.get("transforms") for run in experiment.runs)
+    if changed or experiment.is_continued or not experiment.has_published_limit:
         return {}
     paper = experiment.reference if experiment.base == "ppo" else None
     later = benchmark.REIMPLEMENTATIONS.get(experiment.benchmark or "", {}).get(experiment.base)
