@@ -18,6 +18,8 @@ def import_later(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return a package's ``__getattr__``, which imports names, and ``__dir__``, which lists them.
 
+    The package's class is changed, so that importing a module does not hide a function of its name.
+
     Args:
         package: Name of the package.
         homes: Module, named from the package -> names that it defines.
@@ -26,7 +28,7 @@ def import_later(
 
     class Package(ModuleType):
         def __setattr__(self, name: str, value: Any) -> None:
-            # a module, such as safe_rl.evaluate, does not take the place of a function
+            # such as the module safe_rl.evaluate
             if not (name in modules and isinstance(value, ModuleType)):
                 super().__setattr__(name, value)
 

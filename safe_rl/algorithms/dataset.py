@@ -43,13 +43,13 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             )
         n = config.memory.get("n_steps", 1)  # the last n of a row wait for their n-step returns
         waiting = 0 if n == 1 else n * env.batch_size.numel() * env.steps_per_decision
-        begin = setting(config, "exploration.random_steps") + waiting
+        needed = setting(config, "exploration.random_steps") + waiting
         frames = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
         warning = (
             f"Nothing will be learned: the run has {frames:,} steps, and learning begins after "
-            f"{begin:,} (exploration.random_steps, memory.n_steps)."
+            f"{needed:,} (exploration.random_steps, memory.n_steps)."
         )
-        return warning if frames < begin else "", True
+        return warning if frames < needed else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
     learns_from = _fill(buffer, node, limits, env, bounded_actions(env))
     return learns_from + _other_environment(config), not node.alone

@@ -59,7 +59,8 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
     ]
     return FloatingPointError(
         f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
-        "Lower the learning rate, or look for a policy that has collapsed."
+        "The networks are as before this loss, or with CUDA graphs as after it. Lower the learning "
+        "rate, or look for a policy that has collapsed."
     )
 
 

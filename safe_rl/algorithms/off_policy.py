@@ -39,7 +39,8 @@ _UNUSED = {
     "advantage": "It learns values of single transitions, not advantages of batches: the discount "
     "is loss.gamma, and memory.n_steps says how many steps a transition spans.",
     "cost_advantage": "It learns values of single transitions, not advantages of batches.",
-    "compile": "On a GPU its gradient steps are CUDA graphs instead (policy_update.cuda_graph).",
+    "compile": "torch.compile makes its updates slower. On a GPU its gradient steps are recorded "
+    "as CUDA graphs instead (policy_update.cuda_graph).",
     "critic_update": "Its Q functions are trained together with the policy: policy_update.",
     "then": "It has one update.",
     "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",

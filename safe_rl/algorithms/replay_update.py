@@ -21,9 +21,9 @@ from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.ranges import PART, Checked, Positive, Range
 
-_NOT_RECORDED = (
-    "If the loss reads numbers on the host or depends on them (.item(), if), its gradient steps "
-    "cannot be recorded as CUDA graphs: policy_update.cuda_graph=false."
+_NO_GRAPH = (
+    "If the loss reads numbers on the host (.item()) or branches on them (if), its gradient steps "
+    "cannot be recorded as CUDA graphs: use policy_update.cuda_graph=false."
 )
 
 
@@ -41,10 +41,10 @@ class ReplayUpdate(Checked):
         rates: Learning rates of parameters whose names begin with a key, such as ``log_alpha``; for
             others that of the optimiser.
         max_grad_norm: Norm to which the gradient is clipped, or None.
-        cuda_graph: On a GPU, whether to record gradient steps as CUDA graphs, which take a tenth of
-            the time. The loss's Python code then runs only in the first steps: use False if it
+        cuda_graph: On a GPU, whether to record gradient steps as CUDA graphs, which take a fraction
+            of the time. The loss's Python code then runs only in the first steps: use False if it
             reads numbers on the host (``.item()``) or has attributes that change during training.
-            Optimisers without a setting ``capturable``, such as SGD, are never recorded.
+            Steps of optimisers without a setting ``capturable``, such as SGD, are never recorded.
 
     Raises:
         TypeError: If the loss is no `ReplayLoss`.
@@ -100,8 +100,8 @@ class ReplayUpdate(Checked):
                 "change. Set the step towards the networks, such as tau=0.01."
             )
         # optimisers without this setting may count their steps in Python
-        is_recordable = "capturable" in self.optimizer.defaults
-        self._recorded = cuda_graph and is_recordable and self._device.type == "cuda"
+        is_capturable = "capturable" in self.optimizer.defaults
+        self._uses_graphs = cuda_graph and is_capturable and self._device.type == "cuda"
         self._reported: dict[bool, Collection[str]] = {}
         self._prepare_steps()
         self._counts = {"updates": 0, "owed": 0.0}
@@ -109,12 +109,13 @@ class ReplayUpdate(Checked):
     def _prepare_steps(self) -> None:
         """Make the functions of a minibatch that take a step, with and without the actor."""
         for group in self.optimizer.param_groups:
-            group["capturable"] = self._recorded
+            group["capturable"] = self._uses_graphs
         steps = {with_actor: partial(self._step, with_actor) for with_actor in (True, False)}
-        if self._recorded:
-            with warnings.catch_warnings():  # that pytrees no longer know TensorDicts
-                warnings.simplefilter("ignore")
-                steps = {with_actor: CudaGraphModule(step) for with_actor, step in steps.items()}
+        if self._uses_graphs:
+            with warnings.catch_warnings():
+                # it removes TensorDicts from torch's pytrees, for the whole process
+                warnings.filterwarnings("ignore", message="Tensordict is registered in PyTree")
+                steps = {key: CudaGraphModule(f, device=self._device) for key, f in steps.items()}
         self._steps: Mapping[bool, Callable[[TensorDictBase], tuple[Tensor, Tensor | None]]] = steps
 
     @torch.no_grad()
@@ -143,8 +144,8 @@ class ReplayUpdate(Checked):
             try:
                 values, priority = self._steps[with_actor](minibatch)
             except RuntimeError as error:
-                if self._recorded:
-                    error.add_note(_NOT_RECORDED)
+                if self._uses_graphs:
+                    error.add_note(_NO_GRAPH)
                 raise
             self._counts["updates"] += 1
             if priority is not None:
@@ -154,19 +155,18 @@ class ReplayUpdate(Checked):
             reported = self._reported[with_actor]
             counts = {name: count + (name in reported) for name, count in counts.items()}
         sums = sums.cpu()
-        losses = TensorDict(dict(zip(names, sums, strict=True)))
-        if not sum_of_losses(losses).isfinite():
-            raise divergence(losses)
+        if self._uses_graphs and not sums.isfinite().all():
+            raise divergence(TensorDict(dict(zip(names, sums, strict=True))))
         means = sums / torch.tensor([float(count) for count in counts.values()])
         return dict(zip(names, means, strict=True)) | {"num_updates": torch.tensor(float(number))}
 
     def _step(self, with_actor: bool, minibatch: TensorDictBase) -> tuple[Tensor, Tensor | None]:
         """Take a step. Returns the means of all that the loss can report, and TD errors if any."""
+        minibatch = minibatch.copy()  # losses may replace entries, but a graph reads the given ones
         losses = self.loss(minibatch) if with_actor else self.loss.critic_losses(minibatch)
         total = sum_of_losses(losses)
-        # a graph that is being recorded computes nothing yet
-        recording = self._recorded and torch.cuda.is_current_stream_capturing()
-        if not recording and not total.isfinite():
+        is_capturing = self._uses_graphs and torch.cuda.is_current_stream_capturing()
+        if not is_capturing and not total.isfinite():  # a capture computes nothing
             raise divergence(losses)
         # `zero_grad` of the optimiser takes twenty times as long
         for parameter in self._parameters:
@@ -203,7 +203,7 @@ class ReplayUpdate(Checked):
         stored = dict(state_dict["optimizer"])
         # the saved run may have used another device
         stored["param_groups"] = [
-            {**group, "capturable": self._recorded} for group in stored["param_groups"]
+            {**group, "capturable": self._uses_graphs} for group in stored["param_groups"]
         ]
         self.optimizer.load_state_dict(stored)
         self._prepare_steps()  # earlier graphs would use the optimiser's earlier tensors

@@ -232,7 +232,7 @@ def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
     )
     idle = {} if has_multiplier else {"lagrangian": "Its loss has no multiplier."}
     if algo.get("constrained") is False:
-        idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits, unlike cpo.")
+        idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits.")
     return {**idle, **recipe.unused_keys}
 
 

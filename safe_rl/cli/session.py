@@ -126,7 +126,7 @@ class Session:
         if trainer is None:
             if self.folder.certifying.exists():
                 self._certify()
-            elif not self.folder.certificate.exists():
+            elif not (is_job or self.folder.certificate.exists()):
                 length = int(self.config.env.get("num_steps") or 1000)
                 self._certify_if_long(length, self.config.algo.get("constrained") is not False)
             return

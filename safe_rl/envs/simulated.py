@@ -59,7 +59,10 @@ class SimulatedEnv(ConstrainedEnv):
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
     ) -> None:
-        """Set the specs and the seed at the end; ``highest`` is the largest cost of a step."""
+        """Set the specs and the first seed, after everything else is built.
+
+        The largest cost of a step is ``highest``. Without a seed, torch's generator gives one.
+        """
         physics = self._physics
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
         self._has_cost = torch.zeros_like(self._episode, dtype=torch.bool)
@@ -106,7 +109,7 @@ class SimulatedEnv(ConstrainedEnv):
             raise ValueError(f"There must be {self.batch_size[0]} seeds, got {len(seeds)}.")
         for row, seed in enumerate(seeds):
             if seed is not None:
-                require_integer("seed", seed, lowest=-(2**63))
+                require_integer("seed", seed, lowest=0)
                 self._row_seed[row] = rng.row_seeds(seed, 1)[0]
                 self._episode[row] = 0
 

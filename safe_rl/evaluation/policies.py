@@ -29,7 +29,11 @@ _PREFIX = "certified"
 
 
 def find_run(name: str | Path) -> Path:
-    """The folder of a run, or of one of the package's policies: ``certified/PointGoal1``."""
+    """The folder of a run, or of one of the package's policies: ``certified/PointGoal1``.
+
+    Raises:
+        FileNotFoundError: If the package has no such policy.
+    """
     path = Path(name).expanduser()
     if path.exists() or len(path.parts) != 2 or path.parts[0] != _PREFIX:
         return path

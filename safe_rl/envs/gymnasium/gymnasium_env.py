@@ -54,8 +54,9 @@ def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
 
 
 class FloatCosts(gymnasium.Wrapper):
-    """Converts the costs in `info` to floats; ConfigError if one is not a number.
+    """Converts the costs in `info` to floats.
 
+    It raises a ConfigError if one is not a number, or if a step does not return five values.
     Gymnasium puts the costs of a batch into an array of the first row's type. If this is an
     integer, it rounds the costs of the other rows.
     """
@@ -65,10 +66,10 @@ class FloatCosts(gymnasium.Wrapper):
         self._cost_keys = list(cost_keys)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert the costs; ValueError unless the environment returns five values."""
+        """Step, and convert the costs."""
         *values, info = self.env.step(action)
         if len(values) != 4:
-            raise ValueError(
+            raise ConfigError(
                 f"A step of {self.env} returned {len(values) + 1} values instead of five. If its "
                 "cost is one of six values, use from_six_values."
             )
@@ -93,7 +94,7 @@ class SixValues(gymnasium.Wrapper):
         """Take an action; ValueError if the environment returns another number of values."""
         values: tuple[Any, ...] = self.env.step(action)
         if len(values) != 6:
-            raise ValueError(
+            raise ConfigError(
                 f"A step of {self.env} returned {len(values)} values instead of six (observation, "
                 "reward, cost, terminated, truncated, info). For an environment that returns five "
                 "values and has the cost in info, use env=gymnasium."

@@ -55,7 +55,7 @@ class Task(NamedTuple):
         reward: (config, world, measured one step before [N, D], measured now [N, D]) -> [N].
         measure: Measurements whose differences are the reward, world -> [N, D].
         met: (config, world, measured now) -> bool [N], for tasks with goals.
-        next_goal: How a new goal is drawn, for tasks with goals; None: a position.
+        next_goal: How a new goal is drawn, for tasks with goals; None: as a position.
         elements: Kinds of which the task adds one object each.
         touches: Kinds of objects whose contacts with the robot it reads.
         at_origin: Kinds without an object that are observed at the origin.

@@ -145,7 +145,7 @@ def _entry(step: TensorDictBase, name: str) -> Tensor:
         known = list(map(dotted, after.keys(True, True)))
         raise ConfigError(
             f"There is no entry '{name}'.{did_you_mean(name, known)} A step writes "
-            f"{', '.join(known)}. Entries of a Gymnasium dictionary are kept by flatten=False only."
+            f"{', '.join(known)}. Gymnasium's dictionaries need flatten=False."
         )
     return value
 
