@@ -165,7 +165,7 @@ def test_a_copy_continues_as_the_original_does(copied):
         (lambda: 3, {"cost_keys": ["cost"]}, "must return a gymnasium.Env.*returned 3"),
         (Counter, {"num_env": 2}, "'num_env' is for gymnasium.make.*Did you mean 'num_envs'"),
         (Counter, {"num_envs": 0}, "'num_envs' must be an integer of at least 1"),
-        (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*by flatten=False only"),
+        (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*need flatten=False"),
         (Counter, {"num_steps": 0}, "'num_steps' must be an integer of at least 1"),
     ],
 )
