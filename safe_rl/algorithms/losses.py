@@ -43,7 +43,9 @@ def sum_of_losses(losses: TensorDictBase) -> Tensor:
     return torch.stack([value.reshape(()) for value in terms.values()]).sum()
 
 
-def divergence(losses: TensorDictBase) -> FloatingPointError:
+def divergence(
+    losses: TensorDictBase, outcome: str = "This step is not taken."
+) -> FloatingPointError:
     """Make the error for losses whose sum is not finite: it names them, and says what to do.
 
     Examples:
@@ -59,8 +61,7 @@ def divergence(losses: TensorDictBase) -> FloatingPointError:
     ]
     return FloatingPointError(
         f"{' and '.join(wrong) or 'The sum of the losses is not finite'}: training has diverged. "
-        "The networks are as before this loss, or with CUDA graphs as after it. Lower the learning "
-        "rate, or look for a policy that has collapsed."
+        f"{outcome} Lower the learning rate, or look for a policy that has collapsed."
     )
 
 

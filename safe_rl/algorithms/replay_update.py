@@ -156,7 +156,8 @@ class ReplayUpdate(Checked):
             counts = {name: count + (name in reported) for name, count in counts.items()}
         sums = sums.cpu()
         if self._uses_graphs and not sums.isfinite().all():
-            raise divergence(TensorDict(dict(zip(names, sums, strict=True))))
+            taken = "Steps have been taken on it: continue from a checkpoint."
+            raise divergence(TensorDict(dict(zip(names, sums, strict=True))), taken)
         means = sums / torch.tensor([float(count) for count in counts.values()])
         return dict(zip(names, means, strict=True)) | {"num_updates": torch.tensor(float(number))}
 

@@ -241,6 +241,11 @@ def test_every_value_of_a_sweep_is_checked():
             read_command(["-m", "seed=0,1", wrong])
 
 
+@pytest.mark.parametrize("flags", [["-sc", "install=bash"], ["--help"]])
+def test_questions_to_hydra_pass_untouched(flags):
+    read_command([*flags, "no_such=key"])
+
+
 def test_configurations_are_shown_with_wrong_values_but_not_with_wrong_names():
     read_command(["--cfg", "job", "seed=abc"])
     with pytest.raises(CommandLineError, match="Did you mean 'frames'"):

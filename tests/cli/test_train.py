@@ -41,6 +41,7 @@ def test_configurations_are_shown(command):
     ("overrides", "words"),
     [
         (["lr=1e-4"], "'lr=1e-4': there is no key 'lr'. Did you mean 'policy_update.optimizer.lr'"),
+        (["loss.clip_epsilon=nan"], "loss.clip_epsilon=nan: it must be a number above 0"),
         (["env.hazards_num=abc"], "'hazards_num' must be a whole number from 0"),
         (["loss._target_=os.system"], "loss._target_=os.system: configurations reach only parts"),
         (["-m", "seed=0,abc"], "seed=abc: it must be a whole number"),

@@ -44,6 +44,20 @@ def test_the_newest_are_kept_and_restored(tmp_path):
     assert read_facts(newest) == {"epoch": 3}
 
 
+def test_the_best_one_is_replaced_only_by_a_better_one(tmp_path):
+    components = parts(1)
+    store = CheckpointStore(tmp_path, components, keep_last=1)
+    written = []
+    for steps, score in ((1, -5.0), (2, -7.0), (3, 2.0), (4, 2.0), (5, 1.0)):
+        components["counter"].value = steps
+        written.append(store.save_best(steps, score))
+    assert written == [True, False, True, False, False]
+    (best,) = checkpoints_in(store.best)
+    restored = parts(0)
+    CheckpointStore.load(best, restored)
+    assert restored["counter"].value == 3
+
+
 def test_several_best_ones_are_those_with_the_highest_scores(tmp_path):
     store = CheckpointStore(tmp_path, parts(1), keep_last=1, keep_best=2)
     scores = ((1, 3.0), (2, 9.0), (3, 5.0), (4, 4.0), (5, 9.0), (6, 9.0))

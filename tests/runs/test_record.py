@@ -63,6 +63,11 @@ def test_algorithms_with_short_epochs_are_judged_by_as_many_steps(epoch, epochs,
     assert final["episode_cost"] == pytest.approx(2 * final["episode_return"])
 
 
+def test_final_figures_without_any_episode_are_nan():
+    table = {"episode_return": [NAN], "steps": [10.0], "time_total": [1.0]}
+    assert math.isnan(final_figures(table, [])["episode_return"])
+
+
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=1500",
                             "frames_per_batch=1000")  # fmt: skip

@@ -7,7 +7,7 @@ from statistics import fmean
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
-from run_configs import without_times
+from run_configs import assert_resumes_exactly, without_times
 
 from safe_rl.algorithms import PolicyUpdate
 from safe_rl.objectives import PPOLagrangianLoss
@@ -77,6 +77,15 @@ def test_the_same_seed_gives_the_same_table_but_for_times(tmp_path):
     assert without_times(first / "progress.csv") == without_times(second / "progress.csv")
     train(tmp_path / "other", "seed=1")
     assert without_times(first / "progress.csv") != without_times(tmp_path / "other/progress.csv")
+
+
+def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
+    # episodes of 27 steps are open at the end of every batch of 40; a descent of the limit would
+    # depend on the frames of a run
+    make = lambda name, *half: point_mass_trainer(  # noqa: E731
+        tmp_path / name, "limits=paper", *half, num_steps=27
+    )
+    assert_resumes_exactly(make, tmp_path, "frames=640")
 
 
 def best_of(folder):
