@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from safe_rl.processes import leave_signals_to_parent
@@ -35,8 +36,12 @@ class MakeEnv(Protocol):
 Makers = list[Callable[[], EnvBase]]
 
 
-def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> Makers:
+def split_rows(
+    env: EnvBase, make_env: MakeEnv, num_collectors: int, first_steps: Tensor | None = None
+) -> Makers:
     """Functions, one per worker, that make environments with parts of the rows of ``env``.
+
+    Their first episodes begin at ``first_steps`` [N], by default at step 0.
 
     If the environment has states that can be copied (``get_state``), workers continue its rows from
     their next reset. Otherwise every worker makes a new environment with a seed of its own, whose
@@ -51,14 +56,20 @@ def split_rows(env: EnvBase, make_env: MakeEnv, num_collectors: int) -> Makers:
     seeds = torch.randint(2**62, (num_collectors,)).tolist()
     rows = env.batch_size.numel() // num_collectors
     before = env.steps_before
+    firsts = [None] * num_collectors if first_steps is None else first_steps.split(rows)
     return [
-        partial(_make_rows, make_env, rows, state, seed, before)
-        for state, seed in zip(states, seeds, strict=True)
+        partial(_make_rows, make_env, rows, state, seed, before, first)
+        for state, seed, first in zip(states, seeds, firsts, strict=True)
     ]
 
 
 def _make_rows(
-    make_env: MakeEnv, num_envs: int, state: TensorDictBase | None, seed: int, steps_before: int
+    make_env: MakeEnv,
+    num_envs: int,
+    state: TensorDictBase | None,
+    seed: int,
+    steps_before: int,
+    first_steps: Tensor | None,
 ) -> EnvBase:
     # for the policy's noise: every worker needs its own
     torch.manual_seed(seed)
@@ -70,6 +81,7 @@ def _make_rows(
     else:
         env.set_seed(seed % 2**31)
         env.continue_from(steps_before)
+    env.first_steps = first_steps
     # again, because an environment may seed torch's global generator when it is seeded
     torch.manual_seed(seed)
     return env
@@ -118,8 +130,13 @@ class WorkerCollector:
                 "num_collectors, and frames_per_batch of num_envs."
             )
         self.storing_device = torch.device(device)
-        self._start = lambda: start(split_rows(env, make_env, num_collectors))
+        self._first_steps: Tensor | None = None
+        self._start = lambda: start(split_rows(env, make_env, num_collectors, self._first_steps))
         self._workers: Any = None
+
+    def stagger(self, steps: Tensor) -> None:
+        """Start the rows at these steps [N] of their first episodes. Call it before collecting."""
+        self._first_steps = steps
 
     def __iter__(self) -> Iterator[TensorDictBase]:
         """Start the workers and collect without end.

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot
 from torchrl.envs import EnvBase
 
@@ -38,6 +39,8 @@ class ConstrainedEnv(EnvBase):
         steps_per_decision: Environment steps that one call of `step` takes. If it is not 1, each
             call writes their number to `steps_taken` [N, 1]: it is lower where an episode ends.
         steps_before: Steps of every row in earlier parts of the run.
+        first_steps: Steps [N] after which the episodes of the next reset begin; None (the default)
+            is 0. It needs a state with `step_count`.
         render: Method that draws pictures as `SimulatedEnv.render` does; None if there is none.
 
     Examples:
@@ -54,6 +57,7 @@ class ConstrainedEnv(EnvBase):
     seconds_per_step: Any = None
     steps_per_decision: Any = 1
     steps_before: int = 0
+    first_steps: Tensor | None = None
     render: Any = None
 
     def get_state(self) -> Any:
@@ -66,6 +70,25 @@ class ConstrainedEnv(EnvBase):
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
         """Set the environments to a state from `get_state`; return what a reset returns."""
         raise NotImplementedError(f"{type(self).__name__} cannot store its state.")
+
+    def add_steps(self, steps: Tensor) -> TensorDictBase:
+        """Add `steps` [N] to the steps of the present episodes; return what a reset returns.
+
+        Raises:
+            KeyError: If the state has no `step_count`.
+        """
+        state = self.get_state()
+        taken = state["step_count"]
+        state["step_count"] = taken + steps.reshape(-1, *[1] * (taken.ndim - 1)).to(taken)
+        return self.set_state(state)
+
+    def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        """Begin episodes as `EnvBase.reset` does, at first those after `first_steps`."""
+        begun = super().reset(tensordict, **kwargs)
+        if self.first_steps is not None:
+            steps, self.first_steps = self.first_steps, None
+            begun.update(self.add_steps(steps))
+        return begun
 
     def get_positions(self) -> TensorDictBase:
         """Return object positions by kind, a TensorDict [N] of [N, K, 3] (m); by default empty."""
@@ -125,8 +148,8 @@ def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[s
 
 
 _DEFAULTS = (
-    *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "render"),
-    *("get_state", "get_positions", "continue_from", "highest_cost"),
+    *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "first_steps"),
+    *("render", "get_state", "add_steps", "get_positions", "continue_from", "highest_cost"),
 )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -53,6 +54,20 @@ class RandomGenerators(GlobalRNGState):
         super().load_state_dict(state)
 
 
+def staggered_steps(env: EnvBase) -> Tensor | None:
+    """Steps [N] at which first episodes start, so that later ones end at different times.
+
+    Row i starts at i · longest / N, rounded down to a multiple of the steps per decision. None if
+    the environment has no state with a ``step_count``.
+    """
+    state = env.get_state()
+    if state is None or "step_count" not in state:
+        return None
+    num_envs, decision = env.batch_size.numel(), env.steps_per_decision
+    steps = torch.arange(num_envs) * env.max_episode_steps // num_envs
+    return steps // decision * decision
+
+
 class WorldSnapshot:
     """The state of the environment, and its observation, at the start of the next epoch.
 
@@ -74,22 +89,10 @@ class WorldSnapshot:
         """Take a snapshot and continue from it."""
         self._go_on_from(self._env.get_state())
 
-    def stagger(self, max_steps: int, multiple: int = 1) -> bool:
-        """Start instance i of N at step i · max_steps / N of its first episode.
-
-        Then the episodes of different instances end at different times. All instances start at a
-        multiple of ``multiple``, the environment steps per decision. Returns whether this was
-        possible: the environment's state must have a ``step_count``.
-        """
-        state = self._env.get_state()
-        steps = state.get("step_count", None)
-        if steps is None:
-            return False
-        offsets = torch.arange(steps.shape[0]) * max_steps // steps.shape[0]
-        offsets = offsets // multiple * multiple
-        state["step_count"] = steps + offsets.reshape(-1, *[1] * (steps.ndim - 1)).to(steps)
-        self._go_on_from(state)
-        return True
+    def stagger(self, steps: Tensor) -> None:
+        """Start the rows at these steps [N] of their first episodes."""
+        self._collector._carrier.update(self._env.add_steps(steps))
+        self._snapshot = self._env.get_state()
 
     def state_dict(self) -> dict[str, Any]:
         """The last snapshot."""

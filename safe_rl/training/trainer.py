@@ -20,7 +20,13 @@ from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
-from safe_rl.training.state import Progress, RandomGenerators, StopRequest, WorldSnapshot
+from safe_rl.training.state import (
+    Progress,
+    RandomGenerators,
+    StopRequest,
+    WorldSnapshot,
+    staggered_steps,
+)
 
 # Parts that only the newest checkpoints hold, for resuming: a replay buffer has gigabytes, the
 # others are several times as large as a policy.
@@ -79,12 +85,9 @@ class Trainer:
         if isinstance(collector, Collector) and env.get_state() is not None:
             self._worlds = WorldSnapshot(env, collector)
         self._is_continued = False
-        wanted = config.get("staggered_starts")
-        if (
-            wanted
-            and self._worlds is not None
-            and self._worlds.stagger(env.max_episode_steps, env.steps_per_decision)
-        ):
+        self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
+        if self._first_steps is not None:
+            (self._worlds or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
@@ -151,7 +154,10 @@ class Trainer:
         """Begin new episodes if the state of the environments was not saved."""
         if self._worlds is not None:
             return
-        self.accounting.forget_open_episodes()
+        if self._first_steps is None:
+            self.accounting.forget_open_episodes()
+        else:
+            self.accounting.ignore_open_episodes()
         if self._recording is not None:
             self._recording.cut_after(self.progress.epoch - 1)
         self.algorithm.forget_open_episodes()

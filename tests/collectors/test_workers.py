@@ -30,13 +30,18 @@ NOISE = {"_target_": "safe_rl.envs.transforms.SensorNoise", "std": 0.5}
 
 @pytest.mark.parametrize("transforms", [{}, {"noise": NOISE}])
 def test_workers_step_the_rows_that_one_process_would(transforms):
-    """With the noise that those would have."""
+    """With the noise that those would have, and with first episodes at different steps."""
     make = partial(make_env, CONFIG, seed=3, num_threads=1, transforms=transforms)
     whole = make(num_envs=6)
-    shares = [make() for make in split_rows(whole, make, num_collectors=3)]
+    first_steps = torch.arange(6) * 5
+    shares = [make() for make in split_rows(whole, make, 3, first_steps)]
     expected = whole.reset()["observation"]
     rows = torch.cat([share.reset()["observation"] for share in shares])
     assert torch.equal(rows, expected)
+    counts = [torch.cat([one.get_state()["step_count"] for one in shares])]
+    _ = [one.reset() for one in shares]
+    counts.append(torch.cat([one.get_state()["step_count"] for one in shares]))
+    assert [count.tolist() for count in counts] == [first_steps.tolist(), [0] * 6]
     assert len({tuple(row.tolist()) for row in rows}) == 6
 
 

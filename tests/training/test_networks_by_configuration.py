@@ -96,7 +96,7 @@ def test_a_memory_recalls_what_was_shown_once(model, lowest, highest, tmp_path):
 
 
 def test_workers_of_a_resumed_run_do_not_begin_with_its_first_episodes_again(tmp_path):
-    """They have no stored worlds, and get new ones."""
+    """They have no stored states, and get new ones, again at different steps of their episodes."""
     keys = ("env=PointGoal1", "collector=process", "collector.num_collectors=1", "record=true")
     run_train(*SMALL, *PPO, *keys, "frames=160", f"hydra.run.dir={tmp_path}")
     run_train(f"resume={tmp_path}", "frames=320")
@@ -104,3 +104,5 @@ def test_workers_of_a_resumed_run_do_not_begin_with_its_first_episodes_again(tmp
     assert steps.shape == (4, 80)
     first, resumed = steps["observation"][:, 0], steps["observation"][:, 40]
     assert not (first == resumed).all(-1).any()
+    for part in steps["next", "done"].squeeze(-1).split(40, dim=1):
+        assert part.int().argmax(1).tolist() == [24, 18, 12, 6]
