@@ -1,9 +1,9 @@
 """Draw environments into `docs/`.
 
-`python examples/render_suite.py` writes `suite.png`, one environment of the benchmark per tile with
-the tasks in lines and robots and levels in columns; `layouts.png`, starts of PointPush2; and below
-`environments/pictures/` a small picture for every family of environments. Names of pictures behind
-the command draw those alone.
+`python examples/render_suite.py` writes three kinds of pictures: `suite.png` with all environments
+of the suite (a line per task, columns for robots and levels), `layouts.png` with starts of
+PointPush2, and in `environments/pictures/` a small picture of every family of environments. To draw
+only some of them, name them as arguments.
 """
 
 import argparse
@@ -78,7 +78,7 @@ def draw_layouts(seed: int) -> Image.Image:
 
 
 def draw_safety_gym(seed: int) -> Image.Image:
-    """A start of the benchmark, the wide picture filled."""
+    """A start of CarPush2, from nearer, so that it fills the wide picture."""
     return Image.fromarray(starts("CarPush2", 1, seed, *SIZE, nearness=1.25)[0])
 
 
@@ -88,7 +88,7 @@ def draw_circle(seed: int) -> Image.Image:
 
 
 def draw_vision(seed: int) -> Image.Image:
-    """What the robot's camera sees, of several worlds that in which there is most to see."""
+    """The image of the robot's camera with the most detail, out of twelve starts."""
     config = EXTRAS["PointGoal1Vision"].replace(vision_size=SIZE)
     seen = SafetyGymEnv(config, num_envs=12, seed=seed).reset()["observation", "vision"]
     pictures = [Image.fromarray(picture) for picture in (seen * 255).byte().numpy()]
@@ -97,7 +97,7 @@ def draw_vision(seed: int) -> Image.Image:
 
 def draw_velocity(seed: int) -> Image.Image:
     """The six robots of the velocity family."""
-    side = SIZE[1]  # twice what is left of it
+    side = SIZE[1]  # the grid is made smaller at the end
     frames = []
     for name in VELOCITY_SUITE:
         env = make_env(name, num_envs=1, seed=seed)
@@ -107,7 +107,7 @@ def draw_velocity(seed: int) -> Image.Image:
 
 
 def draw_gymnasium(seed: int) -> Image.Image:
-    """A cart with a pole, of Gymnasium's that MuJoCo draws."""
+    """Gymnasium's cart with a pole."""
     width, height = SIZE
     size = {"width": width, "height": height}
     node = {"id": "InvertedPendulum-v5", "kwargs": size, "render_mode": "rgb_array"}
@@ -118,7 +118,7 @@ def draw_gymnasium(seed: int) -> Image.Image:
 
 
 def draw_torchrl(seed: int) -> Image.Image:
-    """The humanoid of TorchRL's, the middle of a larger picture."""
+    """TorchRL's humanoid: the middle part of a larger picture."""
     width, height = SIZE
     size = {"from_pixels": True, "render_width": 2 * width, "render_height": 2 * height}
     node = {"id": "HumanoidEnv", "kwargs": size, "observe": ["pixels"], "num_steps": 100}
@@ -146,10 +146,12 @@ PICTURES = {
 def main() -> None:
     """Draw the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("pictures", nargs="*", help=f"all by themselves: {', '.join(PICTURES)}")
+    parser.add_argument("pictures", nargs="*", help=f"by default all: {', '.join(PICTURES)}")
     parser.add_argument("--folder", type=Path, default=Path(__file__).parents[1] / "docs")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    if unknown := set(options.pictures) - set(PICTURES):
+        parser.error(f"no picture is called {', '.join(unknown)}: choose {', '.join(PICTURES)}")
     for name in options.pictures or PICTURES:
         path = options.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
