@@ -68,7 +68,7 @@ def staggered_steps(env: EnvBase) -> Tensor | None:
     return steps // decision * decision
 
 
-class WorldSnapshot:
+class EnvSnapshot:
     """The state of the environment, and its observation, at the start of the next epoch.
 
     Every epoch restores a snapshot, also in a run that is not resumed. The reason: restoring a

@@ -21,10 +21,10 @@ from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.record import RunRecord
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.state import (
+    EnvSnapshot,
     Progress,
     RandomGenerators,
     StopRequest,
-    WorldSnapshot,
     staggered_steps,
 )
 
@@ -81,13 +81,13 @@ class Trainer:
         self._env = env
         self._evaluation, self._recording = evaluation, recording
         # the environments of workers are in other processes
-        self._worlds = None
+        self._snapshot = None
         if isinstance(collector, Collector) and env.get_state() is not None:
-            self._worlds = WorldSnapshot(env, collector)
+            self._snapshot = EnvSnapshot(env, collector)
         self._is_continued = False
         self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
         if self._first_steps is not None:
-            (self._worlds or collector).stagger(self._first_steps)
+            (self._snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
@@ -125,8 +125,8 @@ class Trainer:
             "progress": self.progress,
             "rng": RandomGenerators(),
         }
-        if self._worlds is not None:
-            parts["env"] = self._worlds
+        if self._snapshot is not None:
+            parts["env"] = self._snapshot
         return parts
 
     def resume(self) -> bool:
@@ -148,11 +148,11 @@ class Trainer:
     @property
     def begins_anew(self) -> bool:
         """Whether a resumed run begins new episodes, because checkpoints have no environments."""
-        return self._worlds is None
+        return self._snapshot is None
 
     def _begin_episodes(self) -> None:
         """Begin new episodes if the state of the environments was not saved."""
-        if self._worlds is not None:
+        if self._snapshot is not None:
             return
         if self._first_steps is None:
             self.accounting.forget_open_episodes()
@@ -238,8 +238,8 @@ class Trainer:
         # needs the cores.
         with torch_threads(1):
             batch = next(batches)
-            if self._worlds is not None:
-                self._worlds.take()
+            if self._snapshot is not None:
+                self._snapshot.take()
         if self._recording is not None:
             begun = self.accounting.have_begun
             self._recording.write(self.progress.epoch, batch, begun=begun)
