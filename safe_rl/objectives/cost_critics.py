@@ -63,8 +63,6 @@ class CostCritics(QFunctionLoss):
     cost_unit: Tensor
     reward_unit: Tensor
     reward_sums: Tensor
-    gamma: float
-    loss_function: str
 
     def __init__(
         self,

@@ -12,13 +12,7 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import (
-    Distance,
-    InOneCall,
-    QFunctionLoss,
-    ReplayLoss,
-    check_ensemble,
-)
+from safe_rl.objectives.q_functions import Distance, QFunctionLoss, ReplayLoss, check_ensemble
 from safe_rl.objectives.samples import require
 from safe_rl.ranges import NotNegative, Share
 
@@ -67,61 +61,38 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             noise_clip=noise_clip,
             loss_function=loss_function,
         )
-        self.num_qvalue_nets = 1  # copies of the steps that TorchRL passes to the Q functions
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "qvalue"]
 
-    # TorchRL sets and reads both. They are no buffers, because a resumed run may change them
-    @property
-    def policy_noise(self) -> Tensor:
-        """Standard deviation of the noise on the target policy's actions, [A]."""
-        return self._policy_noise * (self.max_action - self.min_action) / 2
+    def _next_values(self, following: TensorDictBase) -> Tensor:
+        action = self.smoothed_action(following)
+        return self.q_values("qvalue_network", following, action, "target").min(0).values
 
-    @policy_noise.setter
-    def policy_noise(self, share: float) -> None:
-        self._policy_noise = share
-
-    @property
-    def noise_clip(self) -> Tensor:
-        """Bound of the noise on the target policy's actions, [A]."""
-        return self._noise_clip * (self.max_action - self.min_action) / 2
-
-    @noise_clip.setter
-    def noise_clip(self, share: float) -> None:
-        self._noise_clip = share
-
-    def _make_vmap(self) -> None:
-        self._vmap_qvalue_network00 = InOneCall(self.qvalue_network, of_copies=True)
-
-    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions."""
-        for key in (self.tensor_keys.reward, self.tensor_keys.terminated):
-            self.column(tensordict, key)  # TorchRL's errors name neither the key nor its shape
-        loss, metadata = self.value_loss(tensordict)
-        # TorchRL's errors are squared
-        td_error = metadata["td_error"].detach().max(0).values.sqrt()
-        tensordict.set(self.tensor_keys.priority, td_error)
-        return TensorDict(loss_qvalue=loss)
+    @torch.no_grad()
+    def smoothed_action(self, steps: TensorDictBase) -> Tensor:
+        """Actions of the target policy with noise, within their bounds, [..., A]."""
+        action = self._act(steps, self.target_actor_network_params)
+        half = (self.max_action - self.min_action) / 2
+        largest = self.noise_clip * half
+        noise = (torch.randn_like(action) * (self.policy_noise * half)).clamp(-largest, largest)
+        return (action + noise).clamp(self.min_action, self.max_action)
 
     def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
         inputs = steps.select(*self.actor_network.in_keys, strict=False)
         with params.to_module(self.actor_network, preserve_module_state=False):
             return self.actor_network(inputs).get(self.tensor_keys.action)
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with the penalty on costs if there are cost critics."""
+    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Loss of the policy, and the mean value of its actions."""
         action = self._act(tensordict, self.actor_network_params)
         values = self.q_values("qvalue_network", tensordict, action, "frozen").squeeze(-1)
         objective, reported = self.penalised(-values[0], tensordict, action)
-        reported["state_action_value_actor"] = self.of_samples(values.detach(), tensordict)
-        return self._mean(objective, tensordict), reported
-
-    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Loss of the policy, and the mean value of its actions."""
-        loss, metadata = self.actor_loss(tensordict)
-        values = metadata.pop("state_action_value_actor")
-        return TensorDict(loss_actor=loss, qvalue=values.mean(), **metadata)
+        return TensorDict(
+            loss_actor=self._mean(objective, tensordict),
+            qvalue=self.of_samples(values.detach(), tensordict).mean(),
+            **reported,
+        )
 
 
 class TD3LagrangianLoss(CostCritics, TD3Loss):
@@ -147,12 +118,7 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions of reward and costs."""
         losses = super().critic_losses(tensordict)
-        with torch.no_grad():
-            action = self._act(tensordict.get("next"), self.target_actor_network_params)
-            noise = (torch.randn_like(action) * self.policy_noise).clamp(
-                -self.noise_clip, self.noise_clip
-            )
-            action = (action + noise).clamp(self.min_action, self.max_action)
+        action = self.smoothed_action(tensordict.get("next"))
         return losses.set("loss_cost_qvalue", self.cost_qvalue_loss(tensordict, action))
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
-from torchrl.objectives.value import ValueEstimatorBase
+from torchrl.objectives.utils import distance_loss
+from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.objectives.violation import KnownCosts
@@ -22,10 +24,6 @@ class Ensemble(Protocol):
 
     num_networks: int  # E
     in_keys: Sequence[NestedKey]  # of observation and action
-
-    def __call__(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Values [E, ...] of steps [...], with the given parameters."""
-        ...
 
     def layers(self, params: TensorDictBase) -> Any:
         """Convert parameters to the argument of `values`."""
@@ -46,22 +44,6 @@ def check_ensemble(network: Any, what: str) -> None:
 
 Distance = Literal["l2", "smooth_l1", "l1"]
 """Distance of a prediction from its target, see `torchrl.objectives.utils.distance_loss`."""
-
-
-class InOneCall:
-    """Adapter by which TorchRL's losses call an ensemble as if `vmap` had made the function.
-
-    It is a class because a module would become part of the loss, and a function could not be
-    pickled or follow a copy of the loss to another device. With `of_copies`, steps come as one copy
-    per network, and the first copy is used.
-    """
-
-    def __init__(self, network: Ensemble, *, of_copies: bool = False) -> None:
-        self.network, self.of_copies = network, of_copies
-
-    def __call__(self, steps: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
-        """Values [E, ...] of steps, with the given parameters."""
-        return self.network(steps[0] if self.of_copies else steps, params)
 
 
 class ReplayLoss(Checked, LossModule):
@@ -113,6 +95,7 @@ class QFunctionLoss(ReplayLoss):
     """
 
     gamma: float
+    loss_function: str
     # TorchRL's TD3 replaces this property by a list, with which `select_out_keys` fails
     out_keys = LossModule.out_keys
 
@@ -129,6 +112,38 @@ class QFunctionLoss(ReplayLoss):
     def priority_key(self) -> NestedKey:
         """Key of the TD errors, [...]."""
         return self.tensor_keys.priority
+
+    def _make_vmap(self) -> None:
+        """Make no functions by vmap: an ensemble evaluates all of its networks in one call."""
+
+    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the Q functions of rewards."""
+        keys = self.tensor_keys
+        target = self._td_targets(tensordict)
+        action = require(tensordict, keys.action)
+        values = self.q_values("qvalue_network", tensordict, action).squeeze(-1)
+        errors = distance_loss(values, target.expand_as(values), loss_function=self.loss_function)
+        tensordict.set(keys.priority, (values.detach() - target).abs().max(0).values)
+        return TensorDict(loss_qvalue=self._mean(errors.sum(0), tensordict))
+
+    @torch.no_grad()
+    def _td_targets(self, tensordict: TensorDictBase) -> Tensor:
+        """TorchRL's TD targets [...]; TD(0), the default, is computed in half of TorchRL's time."""
+        following = self._next_values(tensordict.get("next"))
+        reward, ends = (
+            self.column(tensordict, key)
+            for key in (self.tensor_keys.reward, self.tensor_keys.terminated)
+        )
+        estimator = self.value_estimator
+        if type(estimator) is not TD0Estimator or estimator.average_rewards:
+            steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), following)
+            return estimator.value_estimate(steps).squeeze(-1)
+        discount = discount_of(tensordict, self.gamma, estimator.tensor_keys.steps_to_next_obs)
+        return (reward + discount * ends.logical_not() * following).squeeze(-1)
+
+    def _next_values(self, following: TensorDictBase) -> Tensor:
+        """Values [..., 1] of the next states, on which the Q functions bootstrap."""
+        raise NotImplementedError
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses and diagnostics of the policy."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
@@ -13,18 +12,9 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
-from torchrl.objectives.utils import distance_loss
-from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import (
-    Distance,
-    InOneCall,
-    QFunctionLoss,
-    check_ensemble,
-    discount_of,
-)
-from safe_rl.objectives.samples import require
+from safe_rl.objectives.q_functions import Distance, QFunctionLoss, check_ensemble
 from safe_rl.ranges import Number, Range, Share
 
 
@@ -79,26 +69,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "loss_alpha", "alpha", "entropy"]
 
-    def _make_vmap(self) -> None:
-        self._vmap_qnetworkN0 = InOneCall(self.qvalue_network)
-
-    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
-        """TorchRL's TD targets [...]; TD(0), the default, is computed in half of TorchRL's time."""
-        keys, following = self.tensor_keys, tensordict.get("next")
-        with torch.no_grad():
-            self._next_action, log_prob = self._act(following)
-            values = self.q_values("qvalue_network", following, self._next_action, "target")
-            lowest = values.min(0).values
-            soft = lowest - self._alpha * log_prob.unsqueeze(-1)
-            estimator = self.value_estimator
-            if type(estimator) is not TD0Estimator or estimator.average_rewards:
-                steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), soft)
-                return estimator.value_estimate(steps).squeeze(-1)
-            goes_on = self.column(tensordict, keys.terminated).logical_not()
-            spanned = estimator.tensor_keys.steps_to_next_obs
-            discount = discount_of(tensordict, self.gamma, spanned)
-            reward = self.column(tensordict, keys.reward)
-            return (reward + discount * goes_on * soft).squeeze(-1)
+    def _next_values(self, following: TensorDictBase) -> Tensor:
+        """Values of the next states, with their entropy."""
+        self._next_action, log_prob = self._act(following)
+        values = self.q_values("qvalue_network", following, self._next_action, "target")
+        return values.min(0).values - self._alpha * log_prob.unsqueeze(-1)
 
     def _act(self, steps: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Actions of the current policy, with gradients, and log π."""
@@ -107,32 +82,20 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             inputs = steps.select(*self.actor_network.in_keys)
             return rsample_and_log_prob(self.actor_network.get_dist(inputs))
 
-    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions."""
-        keys = self.tensor_keys
-        target = self._compute_target_v2(tensordict)
-        action = require(tensordict, keys.action)
-        values = self.q_values("qvalue_network", tensordict, action).squeeze(-1)
-        errors = distance_loss(values, target.expand_as(values), loss_function=self.loss_function)
-        tensordict.set(keys.priority, (values.detach() - target).abs().max(0).values)
-        return TensorDict(loss_qvalue=self._mean(errors.sum(0), tensordict))
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the policy, with the penalty on costs if there are cost critics."""
+    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
+        """Losses of the policy and of α, and diagnostics."""
         action, log_prob = self._act(tensordict)
         values = self.q_values("qvalue_network", tensordict, action, "frozen")
         objective = self._alpha * log_prob - values.min(0).values.squeeze(-1)
         objective, reported = self.penalised(objective, tensordict, action)
-        return self._mean(objective, tensordict), {"log_prob": log_prob.detach(), **reported}
-
-    def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the policy and of α, and diagnostics."""
-        loss, metadata = self.actor_loss(tensordict)
-        log_prob = metadata.pop("log_prob")
-        alpha = self._mean(self.alpha_loss(log_prob), tensordict)
-        entropy = -self._reduce_loss(log_prob, tensordict, reduction="mean")
-        metadata |= {"alpha": self._alpha, "entropy": entropy}
-        return TensorDict(loss_actor=loss, loss_alpha=alpha, **metadata)
+        log_prob = log_prob.detach()
+        return TensorDict(
+            loss_actor=self._mean(objective, tensordict),
+            loss_alpha=self._mean(self.alpha_loss(log_prob), tensordict),
+            alpha=self._alpha,
+            entropy=-self._reduce_loss(log_prob, tensordict, reduction="mean"),
+            **reported,
+        )
 
 
 class SACLagrangianLoss(CostCritics, SACLoss):

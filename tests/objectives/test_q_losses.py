@@ -127,9 +127,9 @@ def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     loss.reward_unit.fill_(0.25)
     torch.manual_seed(1)
     found = loss.actor_losses(steps)
-    base = {"sac": objectives.SACLoss, "td3": objectives.TD3Loss}[kind]
+    stock = as_stock(loss, kind)
     torch.manual_seed(1)
-    reward = base.actor_loss(loss, steps)[0]
+    reward = stock.actor_loss(steps)[0]
     torch.manual_seed(1)
     if kind == "sac":
         action = loss.actor_network.get_dist(steps).rsample()
@@ -233,16 +233,21 @@ def test_the_smoothing_of_td3_is_of_the_range_of_actions():
     low, high = torch.tensor([-0.4, -2.0]), torch.tensor([0.4, 2.0])
     actor = make_bounded_actor(3, low, high, hidden_sizes=[8])
     loss = TD3Loss(actor, make_q(), **TD3 | {"action_spec": Bounded(low, high)})
-    torch.testing.assert_close(loss.policy_noise, 0.2 * high)
-    torch.testing.assert_close(loss.noise_clip, 0.5 * high)
+    steps = make_steps()
+    torch.manual_seed(1)
+    found = loss.smoothed_action(steps)
+    torch.manual_seed(1)
+    noise = (0.2 * torch.randn(6, 2)).clamp(-0.5, 0.5) * high
+    torch.testing.assert_close(found, (actor(steps)["action"] + noise).clamp(low, high))
     # what a resumed run is given is not replaced by what it was before
     assert not [name for name in loss.state_dict() if "noise" in name]
 
 
 def test_the_priority_of_td3_is_the_error_and_not_its_square():
     loss, steps = make_loss("td3"), make_steps()
+    stock = as_stock(loss, "td3")
     torch.manual_seed(1)
-    _, metadata = loss.value_loss(steps.clone())
+    _, metadata = stock.value_loss(steps.clone())
     torch.manual_seed(1)
     loss.critic_losses(steps)
     torch.testing.assert_close(steps["td_error"].square(), metadata["td_error"].max(0).values)
