@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -156,17 +157,11 @@ class OnPolicy(Algorithm, Recipe):
 
     def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
         """Improve the policy and fit the critics, in parallel where they are independent."""
-        constraints = self.constraints
-        given = (batch, constraints.violation, constraints.episode_length)
-
-        def improve() -> Mapping[str, Tensor]:
-            return self.policy_update(*given)
-
-        def fit() -> Mapping[str, Tensor]:
-            return self.critic_update(batch)
-
+        violation, length = self.constraints.violation, self.constraints.episode_length
+        improve = partial(self.policy_update, batch, violation, length)
+        fit = partial(self.critic_update, batch)
         both = (improve(), fit()) if self._shares_critics() else in_parallel(improve, fit)
-        return dict(zip(("policy", "critic"), both, strict=True))
+        return {"policy": both[0], "critic": both[1]}
 
     def _shares_critics(self) -> bool:
         """Whether the policy's update changes a critic: then the updates cannot run in parallel."""

@@ -86,14 +86,11 @@ def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[An
     # Losses set the exploration type, of which a process has only one, and then restore it. In two
     # threads, one would restore what the other has set. So it is set before both and restored here.
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return (first(), second()) if threads == 1 else _beside(first, second, threads // 2)
-
-
-def _beside(first: Callable[[], Any], second: Callable[[], Any], threads: int) -> tuple[Any, Any]:
-    def beside() -> Any:
-        torch.set_num_threads(threads)  # a setting of each thread's own
-        return second()
-
-    with torch_threads(threads), ThreadPoolExecutor(max_workers=1) as pool:
-        other = pool.submit(beside)
-        return first(), other.result()
+        if threads == 1:
+            return first(), second()
+        half = threads // 2
+        # the number of threads is a setting of each thread's own
+        pool = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(half,))
+        with torch_threads(half), pool:
+            other = pool.submit(second)
+            return first(), other.result()
