@@ -120,17 +120,13 @@ def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
     """Components of all bodies but the world, and actuator forces of all joints but the root."""
     low, high = config.contact_force_range or (-torch.inf, torch.inf)
     moving = model.nbody - 1
-    known = {
-        "cinert": Part("cinert", 10 * moving, lambda p: p.outputs["cinert"][:, 1:].flatten(1)),
-        "cvel": Part("cvel", 6 * moving, lambda p: p.outputs["cvel"][:, 1:].flatten(1)),
-        "qfrc_actuator": Part(
-            "qfrc_actuator", model.nv - 6, lambda p: p.outputs["qfrc_actuator"][:, 6:]
-        ),
-        FORCES: Part(
-            FORCES, 6 * moving, lambda p: p.outputs[FORCES][:, 1:].flatten(1).clamp(low, high)
-        ),
-    }
-    return [known[name] for name in observed_parts(config)]
+    parts = [
+        Part("cinert", 10 * moving, lambda p: p.outputs["cinert"][:, 1:].flatten(1)),
+        Part("cvel", 6 * moving, lambda p: p.outputs["cvel"][:, 1:].flatten(1)),
+        Part("qfrc_actuator", model.nv - 6, lambda p: p.outputs["qfrc_actuator"][:, 6:]),
+        Part(FORCES, 6 * moving, lambda p: p.outputs[FORCES][:, 1:].flatten(1).clamp(low, high)),
+    ]
+    return [part for part in parts if part.name in observed_parts(config)]
 
 
 class RobotRenderer(Pictures):
