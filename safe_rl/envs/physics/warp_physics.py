@@ -237,17 +237,17 @@ class WarpPhysics(Physics):
         for name in ("qpos", "qvel", "qacc_warmstart"):
             if name in self._rows:
                 row = self._rows[name]
-                wp.launch(find_failures, row.shape, [row, _LARGEST], [self._warp(self._failed)])
+                wp.launch(find_failures, row.shape, [row, _LARGEST], [wp.from_torch(self._failed)])
         self._reset(self._failed)
         if refresh:
             self._forward(True)
 
     def _substeps(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
-        counts = self._warp(self._counts)
+        counts = wp.from_torch(self._counts)
         for substep in range(num_substeps):
             if path is not None:
                 live = self._rows["mocap_pos"]
-                wp.launch(follow_path, live.shape, [self._warp(path), substep, counts], [live])
+                wp.launch(follow_path, live.shape, [wp.from_torch(path), substep, counts], [live])
             if differ:
                 for name, saved in self._saved.items():
                     wp.copy(saved, self._rows[name])
@@ -270,15 +270,12 @@ class WarpPhysics(Physics):
             note_overflow,
             data.nworld,
             [data.nacon, data.ncollision, data.nefc, data.naconmax, data.njmax, *lost],
-            [self._warp(self._overflow)],
+            [wp.from_torch(self._overflow)],
         )
 
     def _reset(self, mask: Tensor) -> None:
         for name, live in self._rows.items():
-            wp.launch(reset_rows, live.shape, [self._warp(mask), self._start[name]], [live])
-
-    def _warp(self, tensor: Tensor) -> Any:
-        return wp.from_torch(tensor)
+            wp.launch(reset_rows, live.shape, [wp.from_torch(mask), self._start[name]], [live])
 
 
 def _align_capsules(model: Any, data: Any) -> None:
