@@ -120,9 +120,7 @@ def cost_keys(rows: Sequence[Cost]) -> list[str]:
     return ["cost", *(row.key for row in rows), EXCEPTION_KEY]
 
 
-def compute_costs(
-    rows: Sequence[Cost], config: SafetyGymConfig, world: World, failed: Tensor
-) -> Tensor:
+def compute_costs(rows: Sequence[Cost], world: World, failed: Tensor) -> Tensor:
     """Compute the present costs of the worlds, a row for each of `cost_keys(rows)`: [R, N].
 
     Worlds whose physics failed, bool [N], have no cost but `cost_exception` (and the aggregate).
@@ -130,6 +128,7 @@ def compute_costs(
     Raises:
         ConfigError: If a registered cost is not one finite number of at least 0 per world.
     """
+    config = world.scene.config
     magnitudes = [world.require(row.key, row.magnitude(config, world)) for row in rows]
     if world.physics.maybe_any(failed):
         magnitudes = [magnitude.masked_fill(failed, 0.0) for magnitude in magnitudes]

@@ -186,8 +186,8 @@ class SafetyGymEnv(SimulatedEnv):
             require_episodes(self._begun)
         failed = self._advance(action)
         now = self._task.measure(world)
-        reward = dense_reward(self._task, config, world, self._measured, now, failed)
-        costs = compute_costs(self._costs, config, world, failed)
+        reward = dense_reward(self._task, world, self._measured, now, failed)
+        costs = compute_costs(self._costs, world, failed)
         torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)
         met, stuck = self._handle_goals(now, failed)
@@ -222,7 +222,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
-        met = goals_met(self._task, self.config, self._world, now, failed)
+        met = goals_met(self._task, self._world, now, failed)
         if not (self.config.continue_goal and self._physics.maybe_any(met)):
             return met, None
         stuck = next_goals(self._world, self._plan, self._step_key(), met)

@@ -13,7 +13,6 @@ from functools import cache, partial, reduce
 import torch
 from torch import Tensor
 
-from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import ELEMENTS, NUM_RAY_GROUPS, Element
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Block, Scene, World
@@ -96,13 +95,14 @@ def pseudo_lidar(
     return reduce(torch.maximum, turns[1:-1].view(shape).unbind(2)).flatten(1)
 
 
-def lidar_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
+def lidar_blocks(scene: Scene, device: torch.device) -> list[Block]:
     """Return all lidars of a configuration as one block; no block if there is no lidar."""
+    config = scene.config
     elements = [element for element in ELEMENTS if element.observed(config)]
     if not elements:
         return []
     make = _pseudo if config.lidar_type == "pseudo" else _natural
-    read = make(config, scene, elements, device)
+    read = make(scene, elements, device)
     bins, kinds = config.lidar_num_bins, [element.kind for element in elements]
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
@@ -118,9 +118,10 @@ def _read_awake(read: Callable[[World], Tensor], columns: slice, world: World) -
 
 
 def _pseudo(
-    config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
+    scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
     """Return a function that reads all lidars in one pass over the objects that they see."""
+    config = scene.config
     kinds = [element.kind for element in elements]
     seen = sorted(
         (slot, kinds.index(kind))
@@ -162,14 +163,14 @@ def ray_directions(num_rays: int) -> Tensor:
 
 
 def _natural(
-    config: SafetyGymConfig, scene: Scene, elements: list[Element], device: torch.device
+    scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
     """Return a function that casts rays, each at one geom group: exp(-distance), 0 for a miss.
 
     Two peculiarities of the benchmark are kept: the floor and the robot's limbs have the goal's
     group; groups beyond MuJoCo's six (the circle's) are never seen.
     """
-    rays = ray_directions(config.lidar_num_bins).to(device)
+    rays = ray_directions(scene.config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))
     column = torch.tensor([groups.index(element.group) for element in elements], device=device)
 

@@ -24,12 +24,12 @@ from safe_rl.envs.safety_gym.renderer import vision_blocks
 from safe_rl.envs.safety_gym.world import Block, Bounds, Scene, Shapes, World
 
 
-def _plain(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
+def _plain(scene: Scene, device: torch.device) -> list[Block]:
     return [
         Block({row.name: (size,)}, partial(_read, row, size), row.bounds)
         for row in READINGS
-        if row.present(config)
-        for size in [row.size(config, scene)]
+        if row.present(scene.config)
+        for size in [row.size(scene.config, scene)]
     ]
 
 
@@ -38,12 +38,7 @@ def _read(row: Reading, size: int, world: World) -> Tensor:
     return world.require(f"The observation '{row.name}'", row.read(world), size)
 
 
-SOURCES: tuple[Callable[[SafetyGymConfig, Scene, torch.device], list[Block]], ...] = (
-    sensor_blocks,
-    lidar_blocks,
-    _plain,
-    vision_blocks,
-)
+SOURCES = (sensor_blocks, lidar_blocks, _plain, vision_blocks)
 
 
 class Observer(NamedTuple):
@@ -71,7 +66,7 @@ class Observer(NamedTuple):
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
     """Build the observer of a scene; ConfigError if a component cannot be observed."""
-    blocks = [block for source in SOURCES for block in source(scene.config, scene, device)]
+    blocks = [block for source in SOURCES for block in source(scene, device)]
     names = [name for block in blocks for name in block.shapes]
     if not names:
         raise ConfigError("Nothing is observed: set at least one 'observe_*' key.")

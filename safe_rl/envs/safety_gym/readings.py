@@ -104,7 +104,8 @@ def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint)
     ]
 
 
-def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
+def _named_sensors(scene: Scene) -> list[int]:
+    config = scene.config
     known = {scene.model.sensor(i).name: i for i in range(scene.robot_sensors)}
     for name in config.sensors_obs:
         if name not in known:
@@ -116,8 +117,9 @@ def _named_sensors(config: SafetyGymConfig, scene: Scene) -> list[int]:
     return [known[name] for name in config.sensors_obs]
 
 
-def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
+def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
     """Return the robot's sensors: raw values, hinges as (sin, cos), balls as rotation matrices."""
+    config = scene.config
     if not config.observe_sensors:
         return []
     sensor, joint = mujoco.mjtSensor, mujoco.mjtJoint
@@ -128,7 +130,7 @@ def sensor_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -
                 "on a slide joint, but observations must not depend on the world's origin: remove "
                 "the sensor, or set 'observe_sensors' to False."
             )
-    raw, angles, quaternions = _named_sensors(config, scene), [], []
+    raw, angles, quaternions = _named_sensors(scene), [], []
     if config.sensors_hinge_joints:
         raw += _joint_sensors(scene, sensor.mjSENS_JOINTVEL, joint.mjJNT_HINGE)
         angles += _joint_sensors(scene, sensor.mjSENS_JOINTPOS, joint.mjJNT_HINGE)

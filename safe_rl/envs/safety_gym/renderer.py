@@ -97,12 +97,13 @@ def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
     return values[row].cpu().numpy()
 
 
-def vision_blocks(config: SafetyGymConfig, scene: Scene, device: torch.device) -> list[Block]:
+def vision_blocks(scene: Scene, device: torch.device) -> list[Block]:
     """Return the component `vision`: RGB in [0, 1], rows from top to bottom, [height, width, 3].
 
     Raises:
         ConfigError: If the robot has no camera of the name "vision".
     """
+    config = scene.config
     if not config.observe_vision:
         return []
     cameras = [scene.model.camera(i).name for i in range(scene.model.ncam)]
@@ -189,7 +190,7 @@ class WorldRenderer:
         self._world = world
         self._config = config = world.scene.config
         self._display = Display(config)
-        lidars = lidar_blocks(config, world.scene, world.physics.device)
+        lidars = lidar_blocks(world.scene, world.physics.device)
         self._lidars = lidars if config.render_lidar_markers else []
 
     def frames(

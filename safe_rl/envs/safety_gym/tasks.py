@@ -137,14 +137,13 @@ def goal_is_button(task: str) -> bool:
     return TASKS[task].next_goal is NextGoal.BUTTON
 
 
-def dense_reward(
-    task: Task, config: SafetyGymConfig, world: World, before: Tensor, now: Tensor, failed: Tensor
-) -> Tensor:
+def dense_reward(task: Task, world: World, before: Tensor, now: Tensor, failed: Tensor) -> Tensor:
     """Return the reward [N] without the bonus for a goal, clipped to ±`reward_clip`.
 
     Raises:
         ConfigError: If a registered task's reward has a wrong shape or is not finite.
     """
+    config = world.scene.config
     reward = world.require(
         f"'reward' of task '{config.task}'", task.reward(config, world, before, now)
     )
@@ -160,10 +159,9 @@ def dense_reward(
     return reward
 
 
-def goals_met(
-    task: Task, config: SafetyGymConfig, world: World, now: Tensor, failed: Tensor
-) -> Tensor:
+def goals_met(task: Task, world: World, now: Tensor, failed: Tensor) -> Tensor:
     """Return which worlds meet their goals, bool [N], for tasks with goals; failed ones do not."""
     assert task.met is not None
+    config = world.scene.config
     met = world.require(f"'met' of task '{config.task}'", task.met(config, world, now))
     return (met > 0) & ~failed
