@@ -127,8 +127,6 @@ class ActionDelay(ConstraintTransform):
         torch.Size([1, 4])
     """
 
-    _pending: Tensor
-
     def __init__(self, steps: Annotated[int, Range(1, 1000)]) -> None:
         super().__init__()
         self._steps = steps
@@ -148,12 +146,8 @@ class ActionDelay(ConstraintTransform):
         action, pending = tensordict.get("action"), self._rows["pending"]
         flat = action.reshape(*pending.shape[:-1], -1)
         due, left = pending.tensor_split([flat.shape[-1]], -1)
-        self._pending = torch.cat([left, flat.to(pending.dtype)], -1)
+        self._rows = {"pending": torch.cat([left, flat.to(pending.dtype)], -1)}
         return tensordict.set("action", due.reshape(action.shape))
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self._rows = {"pending": self._pending}
-        return next_tensordict
 
 
 class ActionRepeat(ConstraintTransform):
