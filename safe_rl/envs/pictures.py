@@ -106,18 +106,14 @@ class Pictures(ABC):
     def __init__(self) -> None:
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
 
+    @property
     @abstractmethod
-    def _load(self) -> mujoco.MjModel:
-        """Compile the model."""
+    def model(self) -> mujoco.MjModel:
+        """The model that is drawn."""
 
     @abstractmethod
     def free_camera(self) -> mujoco.MjvCamera:
         """Return the camera named "free"."""
-
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        """The model that is drawn."""
-        return self._load()
 
     @cached_property
     def data(self) -> mujoco.MjData:

@@ -40,7 +40,9 @@ class Display(Pictures):
         self.options = mujoco.MjvOption()
         self.options.geomgroup[:] = 1  # all groups are visible; they only serve the lidar
 
-    def _load(self) -> mujoco.MjModel:
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model of the decorated world."""
         return self.scene.model
 
     @functools.cached_property
@@ -183,15 +185,14 @@ def boundaries(config: SafetyGymConfig) -> Iterator[Marker]:
 INSET_SHARE = 1 / 3
 
 
-class WorldRenderer:
+class WorldRenderer(Display):
     """Draws the worlds of one environment with lidar halos, goal button, costs and labels."""
 
     def __init__(self, world: World) -> None:
+        super().__init__(world.scene.config)
         self._world = world
-        self._config = config = world.scene.config
-        self._display = Display(config)
         lidars = lidar_blocks(world.scene, world.physics.device)
-        self._lidars = lidars if config.render_lidar_markers else []
+        self._lidars = lidars if self._config.render_lidar_markers else []
 
     def frames(
         self, rows: list[int], has_cost: Tensor, camera: Camera, width: int, height: int
@@ -201,15 +202,11 @@ class WorldRenderer:
         labels = self._world.scene.names if self._config.render_labels else ()
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
         for frame, row in zip(frames, rows, strict=True):
-            self._display.pose(self._world, row)
+            self.pose(self._world, row)
             markers = self._markers(row, readings, bool(has_cost[row]))
-            frame[:] = self._display.frame(camera, width, height, markers, labels)
+            frame[:] = self.frame(camera, width, height, markers, labels)
             self._add_inset(frame)
         return frames
-
-    def close(self) -> None:
-        """Free the resources of OpenGL."""
-        self._display.close()
 
     def _readings(self) -> dict[str, Tensor]:
         """Return the present lidar readings of all worlds by kind, [N, num_bins]."""
@@ -241,7 +238,7 @@ class WorldRenderer:
         config = self._config
         if not (config.observe_vision and config.vision_render):
             return
-        seen = self._display.frame(VISION, *config.vision_size)
+        seen = self.frame(VISION, *config.vision_size)
         width, height = config.vision_render_size
         largest_height, largest_width = (INSET_SHARE * side for side in frame.shape[:2])
         scale = min(1.0, largest_width / width, largest_height / height)

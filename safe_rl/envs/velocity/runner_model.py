@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,7 +157,8 @@ class RobotRenderer(Pictures):
         free.distance, free.elevation = DISTANCE, ELEVATION
         return free
 
-    def _load(self) -> mujoco.MjModel:
+    @cached_property
+    def model(self) -> mujoco.MjModel:
         """The model without shadows, which take most of the time in software OpenGL."""
         model = load_model(self._config)
         model.light_castshadow[:] = 0
