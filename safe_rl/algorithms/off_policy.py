@@ -212,7 +212,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             "multiplier": self.constraints.multiplier,
             "policy_update": self.policy_update,
             "algorithm": self,
-            **self.replay_buffer.components(),
+            "memory": self.replay_buffer if self.replay_buffer.keeps else None,
         }
         return {name: part for name, part in parts.items() if part is not None}
 

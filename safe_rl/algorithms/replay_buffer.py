@@ -13,7 +13,6 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
-from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.ranges import Checked, Count, Range, Share
 from safe_rl.resumable import Resumable
 
@@ -135,10 +134,6 @@ class Memory(Checked):
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
         if self._is_prioritised:
             self._buffer.update_priority(minibatch["index"], minibatch[priority])
-
-    def components(self) -> dict[str, Stateful]:
-        """The parts that checkpoints save: the buffer itself if ``keep``, else none."""
-        return {"memory": self} if self.keeps else {}
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions, the position of the next one, and the state of n-step sums."""
