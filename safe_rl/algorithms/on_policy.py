@@ -100,7 +100,6 @@ class OnPolicy(Algorithm, Recipe):
             if constraints.risk is not None:
                 cost_advantage.set_keys(reward=[CHARGES])
         policy_update = _build_update(config, critic_network=critic, **parts)
-        del parts["actor_network"]
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
