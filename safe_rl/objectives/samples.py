@@ -54,27 +54,22 @@ def mask_keys(loss: Any = None) -> tuple[NestedKey, ...]:
     return loss._loss_mask_keys() if isinstance(loss, LossModule) else AUTO_LOSS_MASK_KEYS
 
 
-def flat_samples(batch: TensorDictBase, loss: Any = None) -> TensorDictBase:
-    """The samples of a batch of any shape as a batch [B], without padding."""
-    mask = sample_mask(batch, loss)
-    flat = batch.reshape(-1)
-    return flat if mask is None else flat[mask.reshape(-1)]
-
-
 def learning_samples(
     batch: TensorDictBase, in_keys: Iterable[NestedKey], loss: Any
 ) -> TensorDictBase:
     """Samples [B] of a loss for a policy with these inputs, or sequences [N, T] if it is recurrent.
 
-    Sequences stay whole and in order. A recurrent policy reads `is_init`, which marks the first
-    steps of episodes.
+    Padding is left out of samples. Sequences stay whole and in order. A recurrent policy reads
+    `is_init`, which marks the first steps of episodes.
 
     Raises:
         ValueError: If sequences are padded.
     """
+    mask = sample_mask(batch, loss)
     if FIRST not in in_keys:
-        return flat_samples(batch, loss)
-    if sample_mask(batch, loss) is not None or batch.ndim != 2:
+        flat = batch.reshape(-1)
+        return flat if mask is None else flat[mask.reshape(-1)]
+    if mask is not None or batch.ndim != 2:
         raise ValueError(
             "A recurrent policy learns from whole sequences [N, T] as collectors make them, "
             "without padding: leave split_trajs at False."

@@ -120,7 +120,7 @@ def from_six_values(
             f"Give a function that makes one environment; num_envs=… makes several. Got {env!r}."
         )
     keys = None if cost_keys is None else [COST, *(key for key in cost_keys if key != COST)]
-    return from_gymnasium(partial(_six_values, env), cost_keys=keys, **settings)
+    return from_gymnasium(lambda: SixValues(env()), cost_keys=keys, **settings)
 
 
 def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
@@ -271,11 +271,7 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
             "package: use from_six_values."
         ) from error
     make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
-    return partial(_six_values, make)
-
-
-def _six_values(make: MakeEnv) -> gymnasium.Env:
-    return SixValues(make())
+    return lambda: SixValues(make())
 
 
 describe_gymnasium = partial(_describe_node, _registered)

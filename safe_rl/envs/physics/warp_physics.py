@@ -53,13 +53,13 @@ class WarpPhysics(Physics):
         device: Device of the simulations.
         contacts: Contacts per simulation that the buffer can hold; all simulations share it.
         constraints: Rows of constraints that the buffer of each simulation can hold.
-        use_graphs: False launches the kernels one by one, for debugging.
 
     Raises:
         NotImplementedError: If the model uses a feature that MuJoCo Warp lacks.
     """
 
     dtype = torch.float32
+    use_graphs = True  # set to False to launch the kernels one by one, for debugging
 
     def __init__(
         self,
@@ -68,12 +68,10 @@ class WarpPhysics(Physics):
         device: torch.device | str,
         contacts: int,
         constraints: int,
-        use_graphs: bool = True,
     ) -> None:
         self.device = torch.device(device)
         self.waits = self.device.type == "cuda"
         self.timestep = float(model.opt.timestep)
-        self.use_graphs = use_graphs
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(self.device)
