@@ -109,22 +109,13 @@ class QEnsemble(TensorDictModuleBase):
         sizes = [observation_size + action_size, *hidden_sizes, num_outputs]
         self.network = EnsembleMLP(num_networks, sizes, device)
 
-    def forward(
-        self, tensordict: TensorDictBase, params: TensorDictBase | None = None
-    ) -> TensorDictBase:
-        """Return values [E, …, n] in a new TensorDict of shape [E, …], for steps […].
-
-        Args:
-            tensordict: Observations and actions.
-            params: Parameters to use instead of the own ones, such as a target network's.
-        """
-        observation, action = (tensordict[key] for key in self.in_keys)
-        layers = None if params is None else self.layers(params)
-        values = self.values(observation, action, layers)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return values [E, …, n] in a new TensorDict of shape [E, …], for steps […]."""
+        values = self.values(*(tensordict[key] for key in self.in_keys))
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
     def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:
-        """Return values [E, …, n]: `forward` without TensorDicts."""
+        """Return values [E, …, n]: `forward` without TensorDicts, with own or given parameters."""
         return self.network(torch.cat([self.scale(observation), action], -1), layers)
 
     def layers(self, params: TensorDictBase) -> Layers:
