@@ -23,9 +23,7 @@ from safe_rl.envs.physics.warp_kernels import (
     restore_rows,
 )
 
-# State that a substep changes, and state that a reset sets.
-_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)
-_INITIAL = (*_INTEGRATED, "ctrl", "mocap_pos", "mocap_quat")
+_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)  # what a substep changes
 _LARGEST = 1e10  # MuJoCo's mjMAXVAL: with larger numbers, a simulation has failed
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
@@ -104,7 +102,8 @@ class WarpPhysics(Physics):
         sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
         self.memory = {name: shared[name] for name in MEMORY if sizes[name]}
         self.outputs = {name: shared[name] for name in OUTPUTS}
-        flat = {name: shared[name].view(num_envs, -1) for name in _INITIAL if shared[name].numel()}
+        initial = [name for name in (*STATE, *MEMORY) if shared[name].numel()]
+        flat = {name: shared[name].view(num_envs, -1) for name in initial}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
         self._saved: dict[str, Any] = {
