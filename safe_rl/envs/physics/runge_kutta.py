@@ -13,13 +13,13 @@ Wanner, Geometric Numerical Integration, section IV.8).
 
 from __future__ import annotations
 
+import mujoco
 import torch
 from torch import Tensor
 
 from safe_rl.envs.physics import Physics
 
 _STAGES = (0.5, 0.5, 1.0)  # times of the second, third and fourth stage, in substeps
-_HUGE = 1e10  # MuJoCo's mjMAXVAL: with larger numbers, a simulation has failed
 _SMALL_ANGLE = 1e-7  # rad; a lower bound of angles, against divisions by 0
 # The product of quaternions p q is (p @ _LEFT) q.
 _LEFT = torch.tensor(
@@ -108,7 +108,7 @@ class _Root:
 def _reset_failed(physics: Physics) -> Tensor:
     """Reset failed simulations: with a warning of MuJoCo, or not finite or huge numbers."""
     largest = torch.maximum(physics.qpos.abs().amax(-1), physics.qvel.abs().amax(-1))
-    failed = physics.failed() | ~(largest < _HUGE)  # also where it is not a number
+    failed = physics.failed() | ~(largest < mujoco.mjMAXVAL)  # also where it is not a number
     if failed.any():
         physics.reset(failed)
         physics.forward(failed)

@@ -24,7 +24,6 @@ from safe_rl.envs.physics.warp_kernels import (
 )
 
 _INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)  # what a substep changes
-_LARGEST = 1e10  # MuJoCo's mjMAXVAL: with larger numbers, a simulation has failed
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
 _LOST_CONTACTS = int(_LOST.BROADPHASE | _LOST.NARROWPHASE | _LOST.CCD | _LOST.CONTACT_MATCH)
@@ -231,10 +230,11 @@ class WarpPhysics(Physics):
 
     def _step(self, num_substeps: int, path: Tensor | None, refresh: bool, differ: bool) -> None:
         self._substeps(num_substeps, path, differ)
+        failed = [wp.from_torch(self._failed)]
         for name in ("qpos", "qvel", "qacc_warmstart"):
             if name in self._rows:
                 row = self._rows[name]
-                wp.launch(find_failures, row.shape, [row, _LARGEST], [wp.from_torch(self._failed)])
+                wp.launch(find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
         self._reset(self._failed)
         if refresh:
             self._forward(True)
