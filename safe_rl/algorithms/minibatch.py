@@ -165,7 +165,6 @@ class MinibatchUpdate(PolicyUpdate):
             ``step_beyond_kl``, else from before the last step. Also ``num_steps``, the gradient
             steps taken, and ``lr``, the next learning rate, if it is adapted.
         """
-        del cost_violation, episode_length
         history: list[TensorDictBase] = []
         num_steps = 0
         if isinstance(self.loss, SurrogateLoss):

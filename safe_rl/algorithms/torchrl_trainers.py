@@ -62,7 +62,6 @@ class ConstraintHook(Resumable, TrainerHookBase):
 
     def log(self, batch: TensorDictBase) -> dict[str, float]:
         """Values to log about the last batch."""
-        del batch
         return self._row
 
     @property
@@ -120,7 +119,6 @@ class UpdateStepper(Resumable, OptimizationStepper):
         Returns:
             Diagnostics of the updates, as scalars; one per constraint for vectors [k].
         """
-        del trainer
         known = self.constraints
         rows = [self.policy_update(sub_batch, known.violation, known.episode_length)]
         if self.critic_update is not None:

@@ -86,10 +86,10 @@ def gae(
     return vec_generalized_advantage_estimate(gamma, lmbda, value, next_value, reward, *flags)[0]
 
 
-def standardise(advantage: Tensor, eps: float = 1e-8) -> Tensor:
+def standardise(advantage: Tensor) -> Tensor:
     """Shift and scale to mean 0 and (population) standard deviation 1."""
     centred = advantage - advantage.mean()
-    return centred / centred.square().mean().sqrt().clamp_min(eps)
+    return centred / centred.square().mean().sqrt().clamp_min(1e-8)
 
 
 def centre(advantage: Tensor) -> Tensor:

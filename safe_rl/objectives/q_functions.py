@@ -153,7 +153,6 @@ class QFunctionLoss(ReplayLoss):
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss [...], with a penalty if there are cost critics, and diagnostics."""
-        del tensordict, action
         return objective, {}
 
     def _mean(self, losses: Tensor, tensordict: TensorDictBase) -> Tensor:

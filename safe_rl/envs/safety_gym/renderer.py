@@ -220,13 +220,12 @@ class WorldRenderer(Display):
     def _markers(self, row: int, readings: dict[str, Tensor], has_cost: bool) -> Iterator[Marker]:
         """Yield rings, goal button, boundaries, and a sphere if the robot `has_cost`."""
         world = self._world
-        robot_pos = world.robot_pos[row].cpu().numpy()
-        robot_mat = world.robot_mat[row].cpu().numpy()
-        seen = {kind: values[row].cpu().numpy() for kind, values in readings.items()}
+        robot_pos, robot_mat = _numbers(world.robot_pos, row), _numbers(world.robot_mat, row)
+        seen = {kind: _numbers(values, row) for kind, values in readings.items()}
         yield from lidar_halos(self._config, seen, robot_pos, robot_mat)
         button = int(world.goal_button[row])
         if button != NO_BUTTON:
-            button_pos = world.at("buttons")[row, button].cpu().numpy()
+            button_pos = _numbers(world.at("buttons"), row)[button]
             size = (2 * self._config.buttons_size,) * 3
             yield Marker(CYLINDER, size, button_pos, GOAL_BUTTON_RGBA)
         yield from boundaries(self._config)
