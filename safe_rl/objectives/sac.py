@@ -33,6 +33,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
+        >>> import torch
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
         >>> q = QEnsemble(3, 2, hidden_sizes=[8], num_networks=2)
@@ -106,6 +107,7 @@ class SACLagrangianLoss(CostCritics, SACLoss):
     Arguments are those of `CostCritics` and of `SACLoss`.
 
     Examples:
+        >>> import torch
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
         >>> from safe_rl.objectives import LagrangeMultiplier
         >>> actor = make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8])
