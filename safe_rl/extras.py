@@ -64,20 +64,10 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def needs_extra(module: str, extra: str) -> Callable[[T], T]:
-    """Mark a class or function as one that needs a package of an extra, for `check_extra`."""
+    """Mark a class or function that needs a package of an extra; `read_part` checks this."""
 
     def note(part: T) -> T:
         part.needed_extra = (module, extra)  # type: ignore[attr-defined]
         return part
 
     return note
-
-
-def check_extra(part: Any) -> None:
-    """Check that the package that a class, one of its bases or a function needs is installed.
-
-    Raises:
-        ModuleNotFoundError: If it is not installed; the message says how to install it.
-    """
-    if needed := getattr(part, "needed_extra", None):
-        require_extra(*needed)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
-from safe_rl.extras import check_extra
+from safe_rl.extras import require_extra
 from safe_rl.ranges import NotNegative, Range, Values, Weight, is_described, values_of
 from safe_rl.targets import locate
 
@@ -101,10 +101,11 @@ def read_part(target: Any, path: str = "") -> Part:
         (['init', 'lr', 'highest'], ['cost_limits', 'highest', 'init', 'lr'])
     """
     found = locate(target, f"{path}._target_" if path else "")
-    try:
-        check_extra(found if path else None)
-    except ModuleNotFoundError as error:
-        raise SettingError(f"{path}: {error}") from None
+    if path and (needed := getattr(found, "needed_extra", None)):
+        try:
+            require_extra(*needed)
+        except ModuleNotFoundError as error:
+            raise SettingError(f"{path}: {error}") from None
     try:
         chain = constructors(found)
         # the package's constructors pass all of **kwargs on to a base; others may use them
