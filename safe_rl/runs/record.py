@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -68,7 +68,7 @@ class RunRecord:
             ValueError: If the table lacks epochs of the continued run.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        with lock_folder(self.folder):
+        with lock_folder(self.folder), ExitStack() as opened:
             if epoch is None and self.folder.has_begun:
                 raise FileExistsError(f"{self.directory} already holds a run.")
             self._steps_before = steps
@@ -77,27 +77,25 @@ class RunRecord:
             # written before the table: a run without a configuration cannot be continued
             if epoch is None or not self.folder.is_run:
                 self._save_config()
-            self._table = TableWriter(self.folder.table, keep_rows=epoch or 0)
+            table = TableWriter(self.folder.table, keep_rows=epoch or 0)
+            self._table = opened.enter_context(table)
             self._logger = build(self._config.get("logger"), log_dir=str(self.directory))
-            if epoch is not None and self._logger is not None:
-                self._logger.continue_from(steps)
-            if not epoch and self._logger is not None:
-                self._logger.log_hparams(given_settings(self.directory, self._config))
+            if self._logger is not None:
+                opened.callback(self._logger.close)
+                if epoch is not None:
+                    self._logger.continue_from(steps)
+                if not epoch:
+                    self._logger.log_hparams(given_settings(self.directory, self._config))
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch
             self._bar = ProgressBar(
                 self.directory, total, steps, self._cost_limits, self._episode_length
             )
-            try:
-                yield
-                self._save_config()
-                self._log_final()
-            finally:
-                self._bar.close()
-                self._table.close()
-                if self._logger is not None:
-                    self._logger.close()
+            opened.callback(self._bar.close)
+            yield
+            self._save_config()
+            self._log_final()
 
     def _save_config(self) -> None:
         if not self._is_config_saved:
