@@ -78,7 +78,7 @@ class Session:
         self._program = program
         modules = list(config.get("import") or [])
         self._imports = "".join(f" import={quote(name)}" for name in modules)
-        self._again = f"{program}{self._imports} {self.folder.resuming}"
+        self._again = f"{program}{self._imports} resume={quote(str(folder))}"
         if program is None:
             imports = f", imports={modules}" if modules else ""
             self._again = f"safe_rl.resume({str(folder)!r}{imports})"

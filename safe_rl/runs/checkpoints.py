@@ -26,8 +26,7 @@ def read_facts(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: If the file is no checkpoint.
     """
-    facts: dict[str, Any] = _read(path, lazy=True)["facts"]
-    return facts
+    return _read(path, lazy=True)["facts"]
 
 
 def read_states(path: Path, names: Collection[str] | None = None) -> dict[str, Any]:
@@ -209,11 +208,10 @@ class CheckpointStore:
         for path in reversed(checkpoints_in(self.last)):
             try:
                 self.load(path, self._components, self._run)
+                restored = path
+                break
             except CheckpointError as error:
                 failures.append(error)
-                continue
-            restored = path
-            break
         if restored is None and failures:
             raise failures[0]
         if restored is None and epochs and not self._none_yet.exists():
@@ -226,7 +224,6 @@ class CheckpointStore:
             warnings.warn(
                 f"{failures[0]} Continuing from the older {restored.name} instead.", stacklevel=2
             )
-
         for best in checkpoints_in(self.best):
             if restored is None or best.name > restored.name:
                 best.unlink()

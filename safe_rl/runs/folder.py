@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import shlex
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -115,11 +114,6 @@ class RunFolder:
             return 0
         return max(0, lines - 1)
 
-    @property
-    def resuming(self) -> str:
-        """The argument that continues the run, quoted for a shell."""
-        return f"resume={shlex.quote(str(self.directory))}"
-
     def check_is_run(self) -> None:
         """Refuse a folder that is not a run's.
 
@@ -174,8 +168,7 @@ def checkpoint_steps(path: Path) -> int | None:
 def checkpoints_in(directory: Path) -> list[Path]:
     """Checkpoints in a folder by ascending steps, readable or not; none if there is no folder."""
     found = directory.iterdir() if directory.is_dir() else ()
-    steps = {path: checkpoint_steps(path) for path in found}
-    return sorted((path for path in steps if steps[path] is not None), key=lambda p: steps[p] or 0)
+    return sorted(path for path in found if checkpoint_steps(path) is not None)
 
 
 def run_of(source: Path) -> tuple[Path, int | None]:
