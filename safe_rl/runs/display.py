@@ -88,7 +88,7 @@ def shown(
         {'cost per 1,000 steps': '60.0/25'}
     """
     figures = {}
-    costs = list(limits) or [key for key in ("cost",) if f"{key}_rate" in row]
+    costs = list(limits) or ["cost"]
     if math.isnan(row["episode_return"]):
         unit, scale = f" per {_RATE_STEPS:,} steps", _RATE_STEPS / episode_length
         if "reward_rate" in row:
@@ -97,7 +97,7 @@ def shown(
     else:
         unit, scale = "", 1.0
         figures["return"] = f"{row['episode_return']:.2f}"
-        values = {key: measured(row, key, limits.get(key)) for key in limits or ["cost"]}
+        values = {key: measured(row, key, limits.get(key)) for key in costs}
     for key, value in values.items():
         figures[f"{key}{unit}"] = f"{value:.1f}{_present_limit(row, key, limits, scale)}"
     multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
