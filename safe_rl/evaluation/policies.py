@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import warnings
 from pathlib import Path
@@ -18,7 +19,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.extras import import_extra
-from safe_rl.files import read_json, replace_json, replacing, save_tensors
+from safe_rl.files import read_json, read_yaml, replace_json, replacing, save_tensors
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -74,10 +75,9 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
             shutil.copyfile(file, copy)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
-    words = source.overrides.read_text().splitlines() if source.overrides.is_file() else []
-    command = " ".join(["python train.py", *(word.removeprefix("- ") for word in words)])
+    words = read_yaml(source.overrides) if source.overrides.is_file() else []
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
-    about |= {"steps": steps, "command": command}
+    about |= {"steps": steps, "command": shlex.join(["python", "train.py", *words])}
     if source.code.is_file():
         about["commit"] = read_json(source.code)[-1]["commit"]
     replace_json(folder / "policy.json", about)

@@ -1,6 +1,7 @@
 """Policies as small folders, those of the package, and policies as ONNX."""
 
 import json
+import shlex
 import shutil
 
 import numpy as np
@@ -45,11 +46,13 @@ def test_a_policy_of_the_package_is_loaded_and_evaluated_as_a_run(run, package, 
 
 
 def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
+    (run / ".hydra").mkdir()
+    (run / ".hydra/overrides.yaml").write_text("- model.hidden_sizes=[16, 16]\n- '+note=it''s'\n")
     assert export([str(run), str(tmp_path / "packed")]) == 0
     about = json.loads((tmp_path / "packed" / "policy.json").read_text())
-    assert (about["environment"], about["algorithm"], about["steps"]) == (
-        "PointGoal1", "ppo_lagrangian", 320,
-    )  # fmt: skip
+    expected = {"environment": "PointGoal1", "algorithm": "ppo_lagrangian", "steps": 320}
+    assert about.items() >= expected.items()
+    assert shlex.split(about["command"])[2:] == ["model.hidden_sizes=[16, 16]", "+note=it's"]
     whole = sum(path.stat().st_size for path in (run / "checkpoints/last").iterdir())
     packed = sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*.torchrl"))
     assert packed < whole / 2
