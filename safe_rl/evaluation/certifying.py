@@ -118,21 +118,19 @@ def certify(
     plain = EvaluationOptions(device=device, num_threads=num_threads)
     trials = [Trial(config, path, plain, make_env) for path in candidates]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
-    highest: dict[str, float] = {}  # `_run` writes it before the claim is tested
-    claim = Claim(limits, highest=highest, **{name: getattr(options, name) for name in asked})
+    claim = Claim(limits, **{name: getattr(options, name) for name in asked})
     groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
-    first = [
-        episodes
-        for group in groups
-        for episodes in next(_run(group, _RANKING, options.ranking, highest, progress))
-    ]
+    first: list[Episodes] = []
+    for group in groups:
+        highest, found = next(_run(group, _RANKING, options.ranking, progress))
+        first += found
     costs = [_costs(episodes) for episodes in first]
-    claims = [claim.with_thresholds(found) for found in costs]
+    claim = replace(claim, highest=highest)
+    claims = [claim.with_thresholds(costs_of_one) for costs_of_one in costs]
     returns: dict[int, list[torch.Tensor]] = {}
 
     def collect(number: int) -> Iterator[dict[str, np.ndarray]]:
-        tested = [trials[number]]
-        for (episodes,) in _run(tested, _TEST, options.episodes, highest, progress):
+        for _, (episodes,) in _run([trials[number]], _TEST, options.episodes, progress):
             returns.setdefault(number, []).append(episodes.returns)
             yield _costs(episodes)
 
@@ -153,12 +151,9 @@ def _costs(episodes: Episodes) -> dict[str, np.ndarray]:
 
 def _candidates(folder: RunFolder) -> list[Path]:
     """Checkpoints, best and last ones, by ascending steps, one for every number of steps."""
-    found = {
-        checkpoint_steps(path): path
-        for kind in ("best", "last")
-        for path in checkpoints_in(folder.checkpoints / kind)
-    }
-    return [found[steps] for steps in sorted(found, key=lambda steps: steps or 0)]
+    kinds = (checkpoints_in(folder.checkpoints / kind) for kind in ("best", "last"))
+    found = {path.name: path for paths in kinds for path in paths}
+    return [found[name] for name in sorted(found)]
 
 
 def _has_warp(trial: Trial) -> bool:
@@ -166,14 +161,14 @@ def _has_warp(trial: Trial) -> bool:
 
 
 def _run(
-    trials: list[Trial], purpose: int, number: int, highest: dict[str, float], progress: bool
-) -> Iterator[list[Episodes]]:
+    trials: list[Trial], purpose: int, number: int, progress: bool
+) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
     """Batches of episodes with seeds that neither training nor the other purpose uses, per trial.
 
     A purpose is a ranking or a test. A ranking is one batch. In a batch of a test every environment
     has one episode, so short episodes do not count before long ones. Trials of one call share the
-    environments of one simulation; trials of several calls have the same layouts. The highest
-    possible cost of an episode is written into ``highest``.
+    environments of one simulation; trials of several calls have the same layouts. Every batch comes
+    with the highest possible costs of an episode.
     """
     trial, together = trials[0], len(trials)
     own = trial.seed  # if the layout is fixed, the seed of training
@@ -187,7 +182,7 @@ def _run(
         closing(trial.make(worlds * together)) as env,
         tqdm(total=number, disable=None if progress else True) as bar,
     ):
-        highest |= {key: env.highest_cost(key) for key in keys}
+        highest = {key: env.highest_cost(key) for key in keys}
         policy = _side_by_side([each.policy(env) for each in trials])
         torch.manual_seed(own + purpose)
         for _ in range(math.ceil(number / batch)):
@@ -195,10 +190,11 @@ def _run(
             # sorted by environment, so those of a trial follow each other
             columns = [found.returns, found.lengths, *found.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)
-            yield [
+            episodes = [
                 Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
                 for returns, lengths, *costs in parts
             ]
+            yield highest, episodes
             bar.update(batch)
 
 

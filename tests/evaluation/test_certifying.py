@@ -161,9 +161,9 @@ def test_policies_that_share_a_simulation_get_their_own_episodes(monkeypatch):
     config = point_mass_config("cost_limits={cost: 19}", "+env.physics=warp")
     options = EvaluationOptions(device="cpu", num_threads=1)
     trials = [Trial(config, Path(action), options, make_env) for action in ("-1", "0", "1")]
-    together = next(_run(trials, _RANKING, 9, {}, progress=False))
+    _, together = next(_run(trials, _RANKING, 9, progress=False))
     for trial, found in zip(trials, together, strict=True):
-        (alone,) = next(_run([trial], _RANKING, 9, {}, progress=False))
+        _, (alone,) = next(_run([trial], _RANKING, 9, progress=False))
         assert found.costs["cost"].shape == (9,)
         assert found.returns.mean().item() == pytest.approx(alone.returns.mean().item(), rel=0.1)
     assert len({found.returns.mean().round(decimals=1).item() for found in together}) == 3
