@@ -55,33 +55,18 @@ class Part(NamedTuple):
         return {name: row for name, row in self.rows.items() if row.is_described}
 
 
-class Optimiser:
-    """Arguments of torch's optimisers, whose own annotations have no ranges.
-
-    Args:
-        lr: Learning rate.
-        betas: Decay rates of the moments.
-        eps: Number added to denominators.
-        weight_decay: Decay of the weights.
-        momentum: Weight of past gradients.
-        fused: Whether to step in one kernel.
-        foreach: Whether to step all tensors together.
-        amsgrad: Whether to keep the maximum of second moments.
-        nesterov: Whether to use Nesterov momentum.
-    """
-
-    def __init__(
-        self,
-        lr: Annotated[float, Range(0, 1000, above=True)],
-        betas: tuple[Weight, Weight],
-        eps: NotNegative,
-        weight_decay: NotNegative,
-        momentum: Weight,
-        fused: bool | None,
-        foreach: bool | None,
-        amsgrad: bool,
-        nesterov: bool,
-    ) -> None: ...
+# torch's own annotations have no ranges
+_OF_OPTIMISERS: dict[str, tuple[Any, str]] = {
+    "lr": (Annotated[float, Range(0, 1000, above=True)], "learning rate"),
+    "betas": (tuple[Weight, Weight], "decay rates of the moments"),
+    "eps": (NotNegative, "number added to denominators"),
+    "weight_decay": (NotNegative, "decay of the weights"),
+    "momentum": (Weight, "weight of past gradients"),
+    "fused": (bool | None, "whether to step in one kernel"),
+    "foreach": (bool | None, "whether to step all tensors together"),
+    "amsgrad": (bool, "whether to keep the maximum of second moments"),
+    "nesterov": (bool, "whether to use Nesterov momentum"),
+}
 
 
 def read_part(target: Any, path: str = "") -> Part:
@@ -140,7 +125,7 @@ def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
     cannot be evaluated, such as a name imported for type checkers only, allows anything.
     """
     if target.__module__.startswith("torch.optim"):
-        return parameters_of(Optimiser)
+        return {name: Parameter(values_of(k), text) for name, (k, text) in _OF_OPTIMISERS.items()}
     meanings = _meanings(target)
     found: dict[str, Parameter] = {}
     for name, parameter, names in _arguments(target):
