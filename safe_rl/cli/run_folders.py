@@ -6,7 +6,6 @@ the configuration names, has changed.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Mapping
@@ -20,7 +19,7 @@ from omegaconf import DictConfig
 from safe_rl import envs
 from safe_rl.envs import ConfigError
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
-from safe_rl.files import read_json, replace_text
+from safe_rl.files import read_json, replace_json
 from safe_rl.runs.folder import RunFolder
 
 
@@ -56,7 +55,7 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     except ConfigError as error:
         shutil.rmtree(folder.robot, ignore_errors=True)
         print(f"{error} The run keeps no copy of its robot: it needs that file as it is now.")
-    replace_text(folder.robot_note, json.dumps(note, indent=1) + "\n")
+    replace_json(folder.robot_note, note)
 
 
 def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
