@@ -149,8 +149,8 @@ class Trial:
             torch.manual_seed(self.seed)
             form = video_format(single, file.suffix[1:])
             frames = record_episode(
-                single, policy, single.cost_keys, deterministic=self.options.deterministic,
-                form=form, camera=self.options.camera,
+                single, policy, deterministic=self.options.deterministic, form=form,
+                camera=self.options.camera,
             )  # fmt: skip
             write_video(file, frames, form)
 

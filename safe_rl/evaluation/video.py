@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from inspect import signature
 from pathlib import Path
 from typing import NamedTuple
@@ -106,7 +106,6 @@ def _picture(env: EnvBase, camera: str, form: VideoFormat) -> Image.Image:
 def record_episode(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
-    cost_keys: Sequence[str],
     *,
     deterministic: bool,
     form: VideoFormat,
@@ -118,7 +117,7 @@ def record_episode(
     shows the final state. The environment must have batch size [1].
     """
     state = env.reset()
-    total = dict.fromkeys((env.return_key, *cost_keys[:1]), 0.0)
+    total = dict.fromkeys((env.return_key, env.cost_keys[0]), 0.0)
     step = 0
     with exploration(deterministic):
         while True:
@@ -133,15 +132,12 @@ def record_episode(
             state = after.exclude("reward")
 
 
-def _frame(
-    picture: Image.Image, step: int, episode_return: float, cost: float | None = None
-) -> np.ndarray:
+def _frame(picture: Image.Image, step: int, episode_return: float, cost: float) -> np.ndarray:
     """The picture above a line with step, return and cost so far, uint8 [height, width, 3]."""
     # at least as wide as the text
     canvas = Image.new("RGB", (max(picture.width, 280), picture.height + _CAPTION), "white")
     canvas.paste(picture)
-    text = f"step {step:>5}     return {episode_return:>7.2f}"
-    text += "" if cost is None else f"     cost {cost:>5.0f}"
+    text = f"step {step:>5}     return {episode_return:>7.2f}     cost {cost:>5.0f}"
     font = ImageFont.load_default(size=14)
     ImageDraw.Draw(canvas).text((8, picture.height + 1), text, fill="black", font=font)
     return np.asarray(canvas)

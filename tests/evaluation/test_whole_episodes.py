@@ -35,6 +35,8 @@ def small_policy():
 class KnownLengths(ConstrainedEnv):
     """The reward of a step is 1, its cost 0.5."""
 
+    cost_keys = ["cost"]  # noqa: RUF012
+
     def __init__(self, lengths=LENGTHS):
         num = self.num = len(lengths)
         super().__init__(batch_size=[num])
@@ -93,7 +95,6 @@ def test_every_world_contributes_its_first_episodes(number, expected):
 class Shaped(KnownLengths):
     """Learning sees another reward than the one that returns are made of."""
 
-    cost_keys = ["cost"]  # noqa: RUF012
     max_episode_steps = 2
     observation_layout = {"observation": slice(0, 1)}  # noqa: RUF012
     return_key = "score"
@@ -121,7 +122,7 @@ def test_returns_are_of_the_entry_that_the_environment_names(transforms, monkeyp
     assert episodes.returns.tolist() == [2.0, 2.0]
     shown = []
     monkeypatch.setattr(video, "_frame", lambda *given: shown.append(given[1:]))
-    list(record_episode(make(), policy, ["cost"], **FILM))
+    list(record_episode(make(), policy, **FILM))
     assert shown == [(0, 0.0, 0.0), (2, 2.0, 1.0)]
 
 
@@ -138,15 +139,13 @@ class Drawn(KnownLengths):
 def test_a_film_takes_the_pictures_that_an_environment_has():
     env, policy = Drawn(), small_policy()
     check_camera(env, "free")
-    frames = list(record_episode(env, policy, ["cost"], **FILM))
+    frames = list(record_episode(env, policy, **FILM))
     # every other step of six, and the end; what the encoder cannot halve twice is cut off
     assert [frame[0, 0, 0] for frame in frames] == [0, 20, 40, 60]
     # beside the narrow picture there is room for what stands below it
     assert {frame.shape for frame in frames} == {(48 + 20, 280, 3)}
     assert {int(frame[:48, 68:].min()) for frame in frames} == {255}
-    without_costs = list(record_episode(env, policy, [], **FILM))
-    assert len(without_costs) == 4
-    assert len({frame[48:].tobytes() for frame in (*frames, *without_costs)}) == 8
+    assert len({frame[48:].tobytes() for frame in frames}) == 4
 
 
 @pytest.mark.parametrize("shape", [(50, 70), (1, 50, 70, 3), (50, 70, 4)])
@@ -154,7 +153,7 @@ def test_a_film_takes_grey_pictures_batches_and_fourth_channels(shape):
     env, policy = Drawn(), small_policy()
     env.render = lambda: np.full(shape, 200, np.uint8)
     check_camera(env, "free")
-    frames = list(record_episode(env, policy, ["cost"], **FILM))
+    frames = list(record_episode(env, policy, **FILM))
     assert {(frame.shape, int(frame[0, 0, 0])) for frame in frames} == {((68, 280, 3), 200)}
 
 
