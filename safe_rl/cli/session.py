@@ -275,7 +275,7 @@ def run_job(config: DictConfig) -> float:
         SystemExit: If it is interrupted.
         ValueError: If its folder holds a run with other settings.
     """
-    hydra = cast(DictConfig, HydraConfig.instance().cfg).hydra
+    hydra = cast(DictConfig, HydraConfig.get())
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
     check_risk(config)  # for this combination of a sweep's values

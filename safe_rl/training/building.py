@@ -131,7 +131,12 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
     source = Path(config["init_from"])
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
-    checkpoint = _newest(source) if source.is_dir() else source
+    checkpoint = RunFolder(source).newest_checkpoint() if source.is_dir() else source
+    if checkpoint is None:
+        raise CheckpointError(
+            f"init_from={source}: there is no checkpoint. Give the folder of a run, or a file in "
+            "its folder 'checkpoints'."
+        )
     same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _cost_loss(config))
     taken = {
         name: network
@@ -150,16 +155,6 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
         network.load_state_dict(weights[name])
     algorithm.networks_replaced()
     return list(taken)
-
-
-def _newest(directory: Path) -> Path:
-    newest = RunFolder(directory).newest_checkpoint()
-    if newest is None:
-        raise CheckpointError(
-            f"init_from={directory}: there is no checkpoint. Give the folder of a run, or a file "
-            "in its folder 'checkpoints'."
-        )
-    return newest
 
 
 def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
