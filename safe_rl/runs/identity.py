@@ -89,25 +89,9 @@ ROLES: dict[str, Role] = {
 All other keys are EXPERIMENT.
 """
 
-# keys that configurations of archived runs lack -> the values that these runs had
-_ABSENT = {"algo._target_": "safe_rl.algorithms.OnPolicy"}
-# likewise; keys with these values are left out of comparisons
-_SILENT: dict[str, Hashable] = {
-    "env.outside": None,
-    "env.physics": "cpu",
-    "env.physics_buffers": 2.0,
-    **dict.fromkeys(
-        [f"env.{part}_scale" for part in ("mass", "friction", "damping", "strength")], 1.0
-    ),
-    "dataset.path": None,
-    "memory.storage": "tensor",
-    "dataset.safe_episodes": False,
-    "dataset.alone": False,
-    "model.head": "auto",
-    "model.normalise": None,
-    "model.encoders": None,
-    "model.memory": None,
-}
+# keys that configurations of archived runs lack -> the values that these runs had; keys with these
+# values are left out of comparisons
+_SILENT: dict[str, Hashable] = {"env.physics": "cpu", "env.physics_buffers": 2.0}
 
 
 def role_of(key: str) -> Role:
@@ -163,13 +147,8 @@ def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
 
 
 def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
-    flat = {
-        key: value
-        for key, value in flatten(config).items()
-        if key not in _SILENT or value != _SILENT[key]
-    }
-    absent = {key: target for key, target in _ABSENT.items() if key.partition(".")[0] in config}
-    return absent | flat
+    flat = flatten(config)
+    return {key: value for key, value in flat.items() if (key, value) not in _SILENT.items()}
 
 
 def flatten(settings: Mapping[str, Any]) -> dict[str, Hashable]:

@@ -102,9 +102,9 @@ def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
     assert first == second != experiment_of(as_saved("init_from=runs/large/seed0"))
 
 
-def test_a_sweep_continues_an_archived_run_that_lacks_the_kind_of_algorithm():
-    now = as_saved()
-    before = {**now, "algo": {k: v for k, v in now["algo"].items() if k != "_target_"}}
+def test_a_sweep_continues_an_archived_run_that_lacks_the_kind_of_physics():
+    before = as_saved()
+    now = {**before, "env": {**before["env"], "physics": "cpu", "physics_buffers": 2.0}}
     assert experiment_of(before) == experiment_of(now)
     assert not differences(before, now)
     assert differences(now, as_saved("frames=5", "num_threads=7", "lagrangian.kp=0.5")) == {
