@@ -33,13 +33,9 @@ class Role(Enum):
     MANNER = ("how a run is carried out: names nothing, and stays", 0, 0, 0)
     MACHINE = ("belongs to the machine", 0, 1, 1)
 
-    def __init__(
-        self, meaning: str, names_experiment: int, may_change: int, may_differ: int
-    ) -> None:
+    def __init__(self, meaning: str, *flags: int) -> None:
         self.meaning = meaning
-        self.names_experiment = bool(names_experiment)
-        self.may_change = bool(may_change)
-        self.may_differ = bool(may_differ)
+        self.names_experiment, self.may_change, self.may_differ = map(bool, flags)
 
 
 ROLES: dict[str, Role] = {

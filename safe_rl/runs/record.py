@@ -157,7 +157,10 @@ def note_code(path: Path, steps: int) -> None:
             ``changed``; see :func:`code_of`.
         steps: Environment steps that the run has made.
     """
-    entries = [entry for entry in _read_code(path) if entry["steps"] < steps]
+    try:
+        entries = [entry for entry in read_json(path) if entry["steps"] < steps]
+    except (OSError, ValueError, TypeError, KeyError):
+        entries = []  # there is no file yet, or it is damaged
     code = code_of()
     if not entries or any(entries[-1].get(name) != value for name, value in code.items()):
         entries.append({"steps": steps, **code})
@@ -209,10 +212,3 @@ def _git(directory: Path, *arguments: str) -> str:
     except (OSError, subprocess.SubprocessError):
         return ""
     return result.stdout.strip()
-
-
-def _read_code(path: Path) -> list[dict[str, Any]]:
-    try:
-        return [entry for entry in read_json(path) if entry["steps"] >= 0]
-    except (OSError, ValueError, TypeError, KeyError):
-        return []
