@@ -12,9 +12,8 @@ from functools import partial
 from pathlib import Path
 from shlex import quote
 from signal import SIGINT
-from typing import Any, cast
+from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
@@ -264,8 +263,8 @@ class Session:
             self._say(f"To train on: {self._again} frames={2 * self.config.frames:_}")
 
 
-def run_job(config: DictConfig) -> float:
-    """Run one job of a sweep, whose configuration Hydra has composed in the job's process.
+def run_job(config: DictConfig, hydra: DictConfig) -> float:
+    """Run one job of a sweep; Hydra has composed both nodes in the job's process.
 
     Returns:
         The value that an optimising sweeper maximises: the run's final return, or −∞ if it ends
@@ -275,7 +274,6 @@ def run_job(config: DictConfig) -> float:
         SystemExit: If it is interrupted.
         ValueError: If its folder holds a run with other settings.
     """
-    hydra = cast(DictConfig, HydraConfig.get())
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
     check_risk(config)  # for this combination of a sweep's values

@@ -79,7 +79,7 @@ class Sweep:
             # otherwise the job would go on, or wait for ever, after the sweep was killed
             end_with_parent(_GRACE)
         try:
-            value = run_job(config)
+            value = run_job(config, hydra)
         except Exception as error:
             summary = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
             if not isinstance(error, RunInUseError):  # then another process owns the folder

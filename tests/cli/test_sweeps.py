@@ -58,7 +58,7 @@ def job(tmp_path, monkeypatch):
         return OmegaConf.create(words)
 
     def carry_out(number, outcome):
-        def run_job(config):
+        def run_job(config, hydra):
             if isinstance(outcome, BaseException):
                 raise outcome
             return outcome
