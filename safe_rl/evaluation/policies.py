@@ -59,11 +59,17 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
 
     The folder gets the configuration, the command, the commit, the certificate of a certified
     checkpoint, and the actor's weights. They have the format of all checkpoints, which is read
-    without unpickling objects. Returns the file of the weights; raises `FileNotFoundError` if there
-    is no such checkpoint.
+    without unpickling objects. Returns the file of the weights.
+
+    Raises:
+        FileNotFoundError: If there is no such checkpoint.
+        FileExistsError: If the folder has other files than an exported policy's.
     """
     source, target = RunFolder(run), RunFolder(folder)
     path, config = find_checkpoint(run, checkpoint), load_config(run)
+    is_exported = (folder / "policy.json").is_file() and folder.resolve() != run.resolve()
+    if any(folder.glob("*")) and not is_exported:
+        raise FileExistsError(f"{folder} has other files: give a new folder for the policy.")
     steps = checkpoint_steps(path)
     is_certified = path.parent.name == "certified"
     kept = target.checkpoint("certified" if is_certified else "last", steps or 0)

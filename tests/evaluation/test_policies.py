@@ -97,5 +97,8 @@ def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     assert export([str(run), str(tmp_path / "a.onx")]) == 1
     assert "FILE.onnx, or a FOLDER" in capsys.readouterr().err
     assert export([str(run), str(tmp_path / "a.onnx"), "checkpoint=certified"]) == 1
-    assert "error: " in capsys.readouterr().err
     assert not (tmp_path / "a.onnx").exists()
+    for folder in (run, tmp_path):  # whose files are not those of an exported policy
+        assert export([str(run), str(folder)]) == 1
+        assert f"error: {folder} has other files" in capsys.readouterr().err
+    assert safe_rl.load(run).policy
