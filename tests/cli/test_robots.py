@@ -80,6 +80,12 @@ def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_pat
     )
 
 
+def test_a_robot_in_the_place_of_its_copy_is_kept(run, tmp_path):
+    with pytest.raises(AssertionError, match="is to hold the run's copy"):
+        run(".")
+    assert (tmp_path / "robot" / "ball.xml").is_file()
+
+
 def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
     folder = run()
     elsewhere = tmp_path / "elsewhere"
