@@ -154,6 +154,8 @@ def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
     if not given:
         return others
     name = given[-1]
+    if any(word.startswith("env=") for word in others):
+        raise CommandLineError(f"slate={name} chooses the environments: leave out env=….")
     if name not in SLATES:
         raise CommandLineError(
             f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} Slates are: {', '.join(SLATES)}."

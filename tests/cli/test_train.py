@@ -45,6 +45,7 @@ def test_configurations_are_shown(command):
         (["env.hazards_num=abc"], "'hazards_num' must be a whole number from 0"),
         (["loss._target_=os.system"], "loss._target_=os.system: configurations reach only parts"),
         (["-m", "seed=0,abc"], "seed=abc: it must be a whole number"),
+        (["-m", "slate=SG6", "env=CarGoal1"], "slate=SG6 chooses the environments: leave out env="),
         (["hydra.run.dir=/proc/runs"], "/proc/runs"),
         (["init_from=nowhere"], "init_from=nowhere: there is no such folder or file."),
     ],
