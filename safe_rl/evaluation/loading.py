@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_recipe
-from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
@@ -47,23 +46,6 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
     check_env_keys(config.env, overrides)
     changed = OmegaConf.merge(config.env, dict(overrides))
     return OmegaConf.to_container(changed)  # type: ignore[return-value]
-
-
-def limits_of(
-    config: DictConfig, others: Mapping[str, float], cost_keys: Sequence[str]
-) -> dict[str, float]:
-    """Cost key -> d: the run's limits on costs of the environment, some replaced by others.
-
-    Raises:
-        ValueError: If others name a cost that the environment does not have.
-
-    Examples:
-        >>> config = OmegaConf.create({"cost_limits": {"cost": 25, "cost_vases": 5}})
-        >>> limits_of(config, {"cost": 10.0}, ["cost", "cost_vases", "cost_hazards"])
-        {'cost': 10.0, 'cost_vases': 5.0}
-    """
-    limits = {**config.cost_limits, **check_cost_limits(others, cost_keys)}
-    return {key: float(limit) for key, limit in limits.items() if key in cost_keys}
 
 
 def transforms_of(config: DictConfig) -> dict[str, Any]:

@@ -14,12 +14,12 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
+from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, StepRecorder
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     find_checkpoint,
     for_evaluation,
-    limits_of,
     load_config,
     load_policy,
     override_env,
@@ -130,7 +130,8 @@ class Trial:
         """
         options = self.options
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
-            limits = limits_of(self.config, options.cost_limits, env.cost_keys)
+            own = {k: float(d) for k, d in self.config.cost_limits.items() if k in env.cost_keys}
+            limits = own | check_cost_limits(options.cost_limits, env.cost_keys)
             recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
             policy = self.policy(env)
             torch.manual_seed(self.seed)
