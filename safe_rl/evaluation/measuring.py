@@ -121,8 +121,8 @@ class Trial:
 
     def run(
         self, *, progress: bool = False, record: Path | None = None
-    ) -> tuple[TensorDictModuleBase, Episodes, dict[str, float]]:
-        """Run whole episodes; returns the policy, the episodes, and the limits on their costs.
+    ) -> tuple[Episodes, dict[str, float]]:
+        """Run whole episodes; returns them, and the limits on their costs.
 
         Args:
             progress: Whether to show a bar.
@@ -141,12 +141,13 @@ class Trial:
             )  # fmt: skip
             if recorder is not None:
                 recorder.flush()
-        return policy, episodes, limits
+        return episodes, limits
 
-    def film(self, policy: TensorDictModuleBase, file: Path, **drawing: Any) -> None:
+    def film(self, file: Path, **drawing: Any) -> None:
         """Write an episode as a film or a picture; ``drawing`` are keys of the environment."""
         # world 0 has the same layouts for any number of worlds, but other random actions
         with closing(self.make(1, **drawing)) as single:
+            policy = self.policy(single)
             torch.manual_seed(self.seed)
             form = video_format(single, file.suffix[1:])
             frames = record_episode(
@@ -198,7 +199,7 @@ def evaluate(
     for film in films:
         with closing(trial.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
-    policy, episodes, limits = trial.run(progress=progress, record=kept[0] if kept else None)
+    episodes, limits = trial.run(progress=progress, record=kept[0] if kept else None)
     reference = suite.reference(trial.node, but_for=_LAYOUTS)
     estimates = summarise(episodes, limits, reference, options.cvar_alpha)
     known = shared_layouts(
@@ -214,7 +215,7 @@ def evaluate(
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     replace_csv(table, [columns, *rows])
     for film in films:
-        trial.film(policy, film, **drawing)
+        trial.film(film, **drawing)
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
 
 

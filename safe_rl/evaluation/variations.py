@@ -244,7 +244,7 @@ def evaluate_variations(
             if progress:
                 print(f"… {variation}", flush=True)
             trial = Trial(changed, checkpoint, options, make_env)
-            _, episodes, limits = trial.run()
+            episodes, limits = trial.run()
         except ValueError as error:
             if not variation.may_lack:
                 raise
