@@ -76,15 +76,15 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     shutil.rmtree(target.checkpoints, ignore_errors=True)
     kept.parent.mkdir(parents=True)
     shutil.copyfile(source.config, target.config)
-    for file, copy in ((source.certificate, target.certificate), (source.code, target.code)):
-        if file.is_file() and (is_certified or file != source.certificate):
-            shutil.copyfile(file, copy)
+    if is_certified and source.certificate.is_file():
+        shutil.copyfile(source.certificate, target.certificate)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
     words = read_yaml(source.overrides) if source.overrides.is_file() else []
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
     about |= {"steps": steps, "command": shlex.join(["python", "train.py", *words])}
     if source.code.is_file():
+        shutil.copyfile(source.code, target.code)
         about["commit"] = read_json(source.code)[-1]["commit"]
     replace_json(folder / "policy.json", about)
     return kept
