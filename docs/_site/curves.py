@@ -74,9 +74,9 @@ def draw_columns(experiments: list[Experiment]) -> Figure:
         for experiment in shown:
             draw_experiment(experiment, "cost", axes, styles[experiment.label])
         set_axes(axes)
-        for axis, height in limits_of(shown, "cost", axes):
-            axis.axhline(height, **LIMIT_STYLE)
-            axis.set_ylim(0, 4 * height)
+        for panel, height in limits_of(shown, "cost"):
+            axes[panel].axhline(height, **LIMIT_STYLE)
+            axes[panel].set_ylim(0, 4 * height)
         axes[0].set_title(name, fontweight="bold")
         axes[2].set_xlabel("environment steps")
         axes[2].xaxis.set_major_locator(MultipleLocator(1_000_000))

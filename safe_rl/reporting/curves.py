@@ -89,8 +89,8 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
         words += [f"{short_number(steps)} steps"] if several else []
         words += [] if key == "cost" else [clean(key, 40)]
         axes[0].set_ylabel(literal("\n".join(words)), fontweight="bold")
-        for axis, height in limits_of(shown, key, axes):
-            axis.axhline(height, **LIMIT_STYLE)
+        for panel, height in limits_of(shown, key):
+            axes[panel].axhline(height, **LIMIT_STYLE)
         set_axes(axes)
     for axis, title in zip(panels[0], _TITLES, strict=True):
         axis.set_title(title, fontweight="bold")
@@ -132,12 +132,12 @@ def draw_small_multiples(
             handles, names = axes[0].get_legend_handles_labels()
             shown = [clean(n.partition(" (")[2].removesuffix(")") or "default", 50) for n in names]
             axes[0].legend(handles, shown, fontsize=6, frameon=False, handlelength=2.5)
-        for axis, height in limits_of(own, key, axes):
-            axis.axhline(height, **LIMIT_STYLE)
+        for panel, height in limits_of(own, key):
+            axes[panel].axhline(height, **LIMIT_STYLE)
         set_axes(axes, ticks=3)
     for kind, title in enumerate(_TITLES):
         finals = [c.mean[-1] for found in means.values() if (c := found[kind]) is not None]
-        limits = [height for axis, height in limits_of(experiments, key, [0, 1, 2]) if axis == kind]
+        limits = [height for panel, height in limits_of(experiments, key) if panel == kind]
         used, unused = np.split(panels[kind::3].ravel(), [len(columns)])
         _level(used, finals, limits)
         for axis in unused:
@@ -157,14 +157,12 @@ def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[flo
         axis.set_ylim(min(low), min(top, max(high)))
 
 
-def limits_of(
-    experiments: Iterable[Experiment], key: str, axes: Sequence[Any]
-) -> list[tuple[Any, float]]:
-    """Pairs of a panel (episode cost, cost rate) and the height of a limit in it: d, d / T_ep."""
+def limits_of(experiments: Iterable[Experiment], key: str) -> list[tuple[int, float]]:
+    """Index of a panel, and height of a limit in it: 1 and d; 2, the cost rate, and d / T_ep."""
     pairs = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
     return [
-        *((axes[1], limit) for limit, _ in pairs),
-        *((axes[2], limit / length) for limit, length in pairs if length is not None),
+        *((1, limit) for limit, _ in pairs),
+        *((2, limit / length) for limit, length in pairs if length is not None),
     ]
 
 
