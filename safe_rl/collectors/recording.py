@@ -50,6 +50,7 @@ class Recording:
         self.folder = Path(folder)
         following = ("observation", "reward", *cost_keys, *_FLAGS)
         self._keys = ["observation", "action", *(("next", key) for key in following)]
+        self._cut: int | None = None  # number of the last batch after which new episodes begin
 
     def begin(self, number: int = 0) -> None:
         """Remove the batches of an earlier recording with this number and higher ones.
@@ -60,11 +61,9 @@ class Recording:
         if self.folder.is_symlink():
             raise ValueError(f"{self.folder} is a link: a recording is written to a folder.")
         check_no_links(self.folder)
-        for path in self.folder.glob(".*.pt"):  # unfinished, of a run that was killed
+        unfinished = self.folder.glob(".*.pt")  # of a run that was killed
+        for path in [*unfinished, *(p for p in _pieces(self.folder) if int(p.stem) >= number)]:
             path.unlink()
-        for path in _pieces(self.folder):
-            if int(path.stem) >= number:
-                path.unlink()
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T]; an earlier file with the same number is replaced.
@@ -75,19 +74,21 @@ class Recording:
         Args:
             number: Number of the batch in order of time.
             batch: Consecutive steps.
-            begun: Rows [N] that start within an episode, partial if the previous batch is missing.
+            begun: Rows [N] that start within an episode; partial after a batch missing or cut.
         """
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
         if not self._place(number - 1).exists():
             before = [n for path in _pieces(self.folder) if (n := int(path.stem)) < number]
             self.cut_after(max(before, default=-1))
-            if begun is not None:
-                steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
+            self._cut = number - 1
+        if begun is not None and self._cut == number - 1:
+            steps[PARTIAL][:, 0] |= begun.cpu().unsqueeze(-1)
         self._store(number, steps)
 
     def cut_after(self, number: int) -> None:
         """Truncate a batch's unfinished episodes and mark them as partial: new ones follow."""
+        self._cut = number
         if not self._place(number).exists():
             return
         steps = _read(self._place(number))

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
-from tensordict import TensorDict
 from torchrl.modules import RandomPolicy
 
 from safe_rl.collectors import (
@@ -84,6 +83,9 @@ def test_episodes_end_where_batches_are_missing(tmp_path):
         whole["observation"].reshape(4, 40, 4),
         steps["observation"][:, [*range(20), *range(30, 50)]],
     )
+    recording.cut_after(3)  # by a resumed run, of which two rows begin within an episode
+    recording.write(4, batches[0], begun=torch.tensor([True, True, False, False]))
+    assert read_recording(tmp_path)["partial"][:, 50, 0].tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize("limits", [{"cost": 2.0}, {"cost_hazards": 1.0, "cost_north": 0.0}, {}])
@@ -97,8 +99,7 @@ def test_safe_episodes_are_those_that_the_accounting_finds(limits):
     assert found.shape == (1, 20 * expected.sum())
     # whole episodes, in order: each ends once, at its last step
     ends = found["next", "done"].reshape(-1, 20)
-    assert ends[:, -1].all()
-    assert not ends[:, :-1].any()
+    assert ends.nonzero()[:, 1].tolist() == [19] * len(ends)
     returns = found["next", "reward"].reshape(-1, 20).double().sum(-1)
     torch.testing.assert_close(returns, episodes.returns[expected])
 
@@ -127,7 +128,6 @@ def test_files_of_offline_benchmarks_are_read(tmp_path, h5py):
     torch.testing.assert_close(steps["action"], torch.tensor(arrays["actions"]).float()[None])
     assert steps["next", "done"].flatten().tolist() == [False, False, True, False, False, True]
     assert steps["next", "terminated"].flatten().tolist().count(True) == 1
-    assert isinstance(steps, TensorDict)
 
 
 def test_what_follows_a_step_is_the_next_observation_where_a_file_does_not_say(tmp_path, h5py):
