@@ -72,8 +72,7 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
 
 def test_rows_that_continue_keep_their_budget_when_others_begin():
     env = transformed(Priced([[1.0] * 9, [1.0] * 9]), "saute")
-    batch = still(env, 1)
-    state = batch[:, -1]["next"].select("observation")
+    state = still(env, 1)[:, -1]["next"].select("observation")
     begun = env.reset(state.set("_reset", torch.tensor([[True], [False]])))
     assert begun["observation"][:, -1].tolist() == pytest.approx([1.0, (1 - 1 / 2) / 0.9])
 
@@ -92,19 +91,21 @@ def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
     assert torch.equal(batch["next", "reward"], expected)
 
 
-@pytest.mark.parametrize("budget", [3, 10, 25])
-def test_a_budget_is_spent_by_as_many_steps_as_it_has_costs(budget):
-    """A tenth, taken ten times from one, leaves more than nothing in binary numbers."""
-    saute = Saute({"cost": budget}, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
-    env = transformed(Priced([[1.0] * 30]), saute=saute)
-    spent = still(env, 30)["next", "reward"][0, :, 0] == -3.0
-    assert spent.nonzero()[:, 0].tolist() == list(range(budget - 1, 30))
+@pytest.mark.parametrize("cost", [1.0, 0.1, 0.7])
+@pytest.mark.parametrize("number", [3, 10, 25])
+def test_a_budget_is_spent_by_as_many_steps_as_it_has_costs(number, cost):
+    """Tenths are not exact in binary numbers, and sums of them less so."""
+    budgets, costs = {"cost": number * cost}, [[cost] * 30]
+    saute = Saute(budgets, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
+    spent = still(transformed(Priced(costs), saute=saute), 30)["next", "reward"][0, :, 0] == -3.0
+    assert spent.nonzero()[:, 0].tolist() == list(range(number - 1, 30))
+    ends = still(transformed(Priced(costs), end=EarlyTermination(budgets)), 30)["next", "done"]
+    assert ends.nonzero()[0, 1] == number  # one step later: the cost has to exceed the budget
 
 
 def test_evaluation_observes_the_budget_and_leaves_the_reward_alone():
     costs = [[1.0, 1.5, 0.0, 0.0]]
-    env = transformed(Priced(costs), "saute", evaluating=True)
-    batch = still(env, 4)
+    batch = still(transformed(Priced(costs), "saute", evaluating=True), 4)
     assert torch.equal(batch["next", "reward"], still(Priced(costs), 4)["next", "reward"])
     assert batch["next", "observation"][0, 1, -1] < 0
 
@@ -126,9 +127,8 @@ def test_a_scaled_reward_is_torchrls_and_returns_are_the_own_ones():
 
 
 def test_a_rescaled_budget_is_spent_by_costs_that_are_spread_over_the_episode():
-    env = Priced([[2.5] * 10])  # 25 in all
     saute = Saute({"cost": 25.0}, discount=0.9, unsafe_reward=-1.0, rescale_budgets=True)
-    batch = still(transformed(env, saute=saute), 10)
+    batch = still(transformed(Priced([[2.5] * 10]), saute=saute), 10)  # costs 25 in all
     left = batch["next", "observation"][0, :, -1]
     assert left[-1].item() == pytest.approx(0.0, abs=1e-6)
     assert (left[:-1] > 0.01).all()

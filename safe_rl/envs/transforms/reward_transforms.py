@@ -20,6 +20,9 @@ from safe_rl.envs.transforms.base import (
 )
 from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
+BUDGET = "budget"
+_ROUNDING = 1e-7  # of a budget: the relative rounding error of costs in single precision is lower
+
 
 class _ChangesReward(ConstraintTransform):
     """Base class of transforms that change `reward`, and keep the environment's own reward."""
@@ -100,24 +103,20 @@ class EarlyTermination(ConstraintTransform):
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return that nothing is spent."""
-        shape = (*done.shape[:-1], len(self._budgets))
-        return {"spent": done.new_zeros(shape, dtype=torch.float64)}
+        return {"spent": done.new_zeros(*done.shape[:-1], len(self._budgets), dtype=torch.float64)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         spent = self._rows["spent"] + costs_of(next_tensordict, self._budgets)
         self._rows = {"spent": spent}
         if self.evaluating and not self.in_evaluation:
             return next_tensordict
-        over = (spent > spent.new_tensor(list(self._budgets.values()))).any(-1, keepdim=True)
+        allowed = (1 + _ROUNDING) * spent.new_tensor(list(self._budgets.values()))
+        over = (spent > allowed).any(-1, keepdim=True)
         for key in ("done", "terminated"):
             next_tensordict.set(key, next_tensordict.get(key) | over)
         # algorithms do not agree on ends that are both
         next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
         return next_tensordict
-
-
-BUDGET = "budget"
-_ROUNDING = 1e-9  # rounding error of the budget that is left after many steps
 
 
 class Saute(_ChangesReward):
