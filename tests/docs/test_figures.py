@@ -138,7 +138,7 @@ def test_quarters_of_harder_tasks():
 
 
 # campaign of exploration -> steps of the environment per logged step: one counted decisions
-TRIED = {"hard_tasks": 4, "held_actions": 1}
+TRIED = {"hard_tasks": 4, "held_actions": 1, "one_transform": 1}
 
 
 def test_quarters_of_what_was_tried_on_hard_tasks():
