@@ -22,6 +22,7 @@ from safe_rl.files import read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.recorded import Run, read_certificate, read_code, read_evaluation, select
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
+from safe_rl.runs.identity import differences
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -118,7 +119,8 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     """Add runs to an archive, or update them there; their names are their paths below ``root``.
 
     Raises:
-        ValueError: If one folder lies in the other, or the archive is none.
+        ValueError: If one folder lies in the other, the archive is none, or it has another run of
+            one of these names.
         OSError: If it cannot be read or written.
     """
     here, there = root.resolve(), archive.resolve()
@@ -126,6 +128,12 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
         raise ValueError(f"archive={archive}: it takes a folder beside {root}, not one within.")
     kept = read_archive(archive) if (archive / RUNS).exists() else {}
     names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
+    for name in kept.keys() & names:
+        if found := differences(kept[name].config, names[name].config):
+            raise ValueError(
+                f"archive={archive}: its run {name} is another one than that in {root}: they "
+                f"differ in {', '.join(found)}. Give another folder for these runs."
+            )
     write_archive(kept | names, archive)
 
 

@@ -17,13 +17,8 @@ EPOCHS = {
     "rates": (0.04, 0.035, 0.03),
 }
 pack = partial(gzip.compress, mtime=0)
-CERTIFICATE = {
-    "checkpoint": None,
-    "episode_return": None,
-    "bounds": {},
-    "episodes": 4,
-    "level": 0.9,
-}
+CERTIFICATE = {"checkpoint": None, "episode_return": None, "bounds": {}, "episodes": 4}
+CERTIFICATE |= {"level": 0.9}
 
 
 @pytest.fixture
@@ -136,9 +131,14 @@ def test_a_run_may_have_a_name_that_pandas_takes_for_a_missing_number(tmp_path):
     assert read_archive(tmp_path / "kept")["null"].table["steps"] == [1000]
 
 
-def test_an_archive_is_not_among_the_runs(runs, capsys):
+def test_an_archive_is_not_among_the_runs_and_keeps_others_of_their_names(runs, tmp_path, capsys):
     assert main([str(runs), f"archive={runs / 'kept'}"]) == 1
     assert "beside" in capsys.readouterr().err
+    keep(write_run(tmp_path / "a").parents[1], tmp_path / "kept")
+    other = write_run(tmp_path / "b", "CarGoal1").parents[1]
+    assert main([str(other), f"archive={tmp_path / 'kept'}"]) == 1
+    assert "its run ppo/seed0 is another one" in capsys.readouterr().err
+    assert read_archive(tmp_path / "kept")["ppo/seed0"].config["env"]["name"] == "PointGoal1"
 
 
 @pytest.mark.parametrize(
