@@ -75,16 +75,16 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     kept = target.checkpoint("certified" if is_certified else "last", steps or 0)
     shutil.rmtree(target.checkpoints, ignore_errors=True)
     kept.parent.mkdir(parents=True)
-    shutil.copyfile(source.config, target.config)
-    if is_certified and source.certificate.is_file():
-        shutil.copyfile(source.certificate, target.certificate)
+    for name in (RunFolder.config, RunFolder.code, RunFolder.certificate):
+        (folder / name).unlink(missing_ok=True)  # of a policy that was exported there before
+        if (run / name).is_file() and (is_certified or name != RunFolder.certificate):
+            shutil.copyfile(run / name, folder / name)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
     words = read_yaml(source.overrides) if source.overrides.is_file() else []
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
     about |= {"steps": steps, "command": shlex.join(["python", "train.py", *words])}
     if source.code.is_file():
-        shutil.copyfile(source.code, target.code)
         about["commit"] = read_json(source.code)[-1]["commit"]
     replace_json(folder / "policy.json", about)
     return kept

@@ -60,12 +60,12 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
 
 def test_only_a_certified_policy_is_packed_as_certified(run, tmp_path):
     (run / "certificate.json").write_text('{"certified": true}')
-    assert export([str(run), str(tmp_path / "last")]) == 0
-    shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified")
-    assert export([str(run), str(tmp_path / "certified")]) == 0
-    for kind in ("last", "certified"):
-        assert [path.name for path in (tmp_path / kind / "checkpoints").iterdir()] == [kind]
-        assert (tmp_path / kind / "certificate.json").is_file() == (kind == "certified")
+    packed = tmp_path / "packed"
+    for kind, which in (("last", ()), ("certified", ()), ("last", ("checkpoint=last",))):
+        assert export([str(run), str(packed), *which]) == 0
+        assert [path.name for path in (packed / "checkpoints").iterdir()] == [kind]
+        assert (packed / "certificate.json").is_file() == (kind == "certified")
+        shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified", dirs_exist_ok=True)
 
 
 @pytest.mark.parametrize("path", sorted(policies.POLICIES.glob("*/certificate.json")), ids=str)
