@@ -58,8 +58,8 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     """Write what is needed to use a run's policy into a folder of a few dozen kB.
 
     The folder gets the configuration, the command, the commit, the certificate of a certified
-    checkpoint, and the actor's weights. They have the format of all checkpoints, which is read
-    without unpickling objects. Returns the file of the weights.
+    checkpoint, a custom robot, and the actor's weights. They have the format of all checkpoints,
+    which is read without unpickling objects. Returns the file of the weights.
 
     Raises:
         FileNotFoundError: If there is no such checkpoint.
@@ -73,12 +73,15 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     steps = checkpoint_steps(path)
     is_certified = path.parent.name == "certified"
     kept = target.checkpoint("certified" if is_certified else "last", steps or 0)
-    shutil.rmtree(target.checkpoints, ignore_errors=True)
+    for former in (target.checkpoints, target.robot):
+        shutil.rmtree(former, ignore_errors=True)
     kept.parent.mkdir(parents=True)
-    for name in (RunFolder.config, RunFolder.code, RunFolder.certificate):
+    for name in (RunFolder.config, RunFolder.code, RunFolder.robot_note, RunFolder.certificate):
         (folder / name).unlink(missing_ok=True)  # of a policy that was exported there before
         if (run / name).is_file() and (is_certified or name != RunFolder.certificate):
             shutil.copyfile(run / name, folder / name)
+    if source.robot.is_dir() and not source.robot.is_symlink():
+        shutil.copytree(source.robot, target.robot, symlinks=True)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
     words = read_yaml(source.overrides) if source.overrides.is_file() else []

@@ -9,7 +9,7 @@ from commands import SMALL
 from run_configs import without_times
 
 import safe_rl
-from safe_rl.cli import evaluate, train
+from safe_rl.cli import evaluate, export, train
 
 ROBOT = """
 <mujoco>
@@ -65,13 +65,15 @@ def run(tmp_path, monkeypatch):
     return begin
 
 
-def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation(run, tmp_path):
+def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation_nor_its_policy(run, tmp_path):
     whole, folder = run("whole", frames=80), run()
-    assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=before"]) == 0
-    write_robot(tmp_path, density=30)
-    assert evaluate.main([str(folder), "episodes=2", "num_threads=1", "name=after"]) == 0
-    rows = [(folder / f"evaluation_{name}.csv").read_text() for name in ("before", "after")]
-    assert rows[0] == rows[1]
+    assert export.main([str(folder), str(policy := tmp_path / "policy")]) == 0
+    rows = []
+    for place in (folder, folder, policy):
+        assert evaluate.main([str(place), "episodes=2", "num_threads=1"]) == 0
+        rows.append((place / "evaluation.csv").read_text())
+        write_robot(tmp_path, density=30)
+    assert rows[0] == rows[1] == rows[2]
     assert train.main([f"resume={folder}", "frames=80"]) == 0
     assert without_times(folder / "progress.csv") == without_times(whole / "progress.csv")
     # the name of the robot, by which runs are told apart, stays
@@ -87,10 +89,8 @@ def test_a_robot_in_the_place_of_its_copy_is_kept(run, tmp_path):
 
 
 def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
-    folder = run()
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    folder = folder.rename(elsewhere / "run")
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    run().rename(elsewhere / "run")
     monkeypatch.chdir(elsewhere)
     assert train.main(["resume=run", "frames=80"]) == 0
     assert safe_rl.load("run").env.rollout(3).shape == (1, 3)
