@@ -262,6 +262,8 @@ def compose_resumed(
     run = RunFolder(directory)
     try:
         run.check_is_run()
+        if run.checkpoints.exists() and not run.has_begun:
+            raise ValueError("it has no progress.csv: an exported policy cannot be trained on")
         config = OmegaConf.create(read_config(run.config))
         said = read_yaml(run.overrides) if run.overrides.is_file() else None
     except (OSError, ValueError) as error:

@@ -15,9 +15,8 @@ NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\"
 
 
 def begin(directory):
-    with RunRecord(
-        directory, point_mass_config("env.robot_base=point"), {"cost": 25.0}, 20
-    ).writing():
+    config = point_mass_config("env.robot_base=point")
+    with RunRecord(directory, config, {"cost": 25.0}, 20).writing():
         pass
     RunFolder(directory).notes.mkdir()
     RunFolder(directory).overrides.write_text(OmegaConf.to_yaml(OmegaConf.create(SAID)))
@@ -106,6 +105,9 @@ def test_only_a_run_can_be_resumed(run):
         read_command([f"resume={run}", "--cfg=job"])
     (run / "config.yaml").write_text("algo: [")
     with pytest.raises(CommandLineError, match=r"config\.yaml cannot be read"):
+        compose_resumed(run, [])
+    (run / "progress.csv").rename(run / "checkpoints")  # those of an exported policy
+    with pytest.raises(CommandLineError, match="an exported policy cannot be trained on"):
         compose_resumed(run, [])
 
 
