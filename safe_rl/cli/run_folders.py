@@ -44,18 +44,10 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     """Note which custom robot a run begins with, and copy its files.
 
     If the files cannot be copied, the note has their hash only, and the reason is printed.
-
-    Raises:
-        ConfigError: If the robot lies where the copy is to be written.
     """
     robot = _own_robot(env)
     if robot is None:
         return
-    if robot.resolve().is_relative_to(folder.robot.resolve()):
-        raise ConfigError(
-            f"'robot_base': {folder.robot} is to hold the run's copy of {robot}: give the run "
-            "another folder."
-        )
     shutil.rmtree(folder.robot, ignore_errors=True)
     note = {"robot_base": env["robot_base"], "sha256": fingerprint(robot), "file": None}
     try:

@@ -159,11 +159,15 @@ class Session:
         config, folder, callbacks = self.config, self.folder, self._callbacks
         if not (isinstance(callbacks, list | tuple) and all(map(callable, callbacks))):
             raise ConfigError(f"callbacks must be a list of functions, [f], got {callbacks!r}.")
-        if not self._continues and folder.has_begun:
+        # of a run, of an exported policy, or the user's own, which this run would replace
+        places = (folder.table, folder.config, folder.checkpoints, folder.robot, folder.transitions)
+        taken = next((place for place in places if place.exists()), None)
+        if not self._continues and taken is not None:
             key = "hydra.run.dir" if self._program else "directory"
+            what = "a run" if folder.has_begun else f"a run or its {taken.name}"
             raise FileExistsError(
-                f"{folder.directory} already holds a run. Continue it with: {self._again}; or give "
-                f"this one another folder, {key}=…"
+                f"{folder.directory} already holds {what}. Continue it with: {self._again}; or "
+                f"give this one another folder, {key}=…"
             )
         if self._continues and is_finished(folder.directory, config.frames):
             more = ": raise 'frames' to train on"

@@ -246,9 +246,10 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     assert safe_rl.load(f"~/{run.directory.name}").directory == run.directory
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "taken").mkdir()
-    (tmp_path / "taken" / "progress.csv").touch()
-    with pytest.raises(FileExistsError, match=rf"resume\('{tmp_path}/taken'\)"):
-        safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
+    for name in ("config.yaml", "progress.csv"):  # the first may be the user's own
+        (tmp_path / "taken" / name).touch()
+        with pytest.raises(FileExistsError, match=rf"resume\('{tmp_path}/taken'\)"):
+            safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
 
 
 @pytest.mark.parametrize(
