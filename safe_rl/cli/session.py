@@ -29,7 +29,7 @@ from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.folder import RunFolder, RunInUseError, lock_folder
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.outcome import final_figures, violation
 from safe_rl.runs.table import TableError, read_table
@@ -119,6 +119,9 @@ class Session:
                     if self.hydra is not None and not (is_job and self.folder.notes.exists()):
                         self._write_notes(self.hydra)
                     outcome = trainer.run()
+        except RunInUseError:
+            self._is_new = False  # another process has made it in the meantime
+            raise
         finally:
             if self._is_new and not (self._has_begun or self.folder.has_begun):
                 shutil.rmtree(self.folder.directory, ignore_errors=True)

@@ -1,18 +1,20 @@
 """Folders of new runs, as the command line makes them."""
 
 import multiprocessing
+from functools import partial
 
 import pytest
-from commands import SMALL, in_a_process
+from commands import SMALL, in_a_process, status_of
 from omegaconf import OmegaConf
 
+from safe_rl.cli import session
 from safe_rl.cli.run_folders import new_folder
+from safe_rl.runs.folder import RunInUseError
 
 
 def hydra_config(directory, *overrides):
-    return OmegaConf.create(
-        {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}
-    )
+    node = {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}
+    return OmegaConf.create(node)
 
 
 def claim(directory):
@@ -35,11 +37,19 @@ def test_a_folder_that_was_named_stays(tmp_path, override):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_that_another_process_makes_first_stays(tmp_path, monkeypatch):
+    def refuse(folder):
+        folder.robot.mkdir(parents=True)
+        raise RunInUseError("in use")
+
+    monkeypatch.setattr(session, "lock_folder", refuse)
+    assert status_of(*SMALL, f"hydra.run.dir={tmp_path / 'run'}") == "in use"
+    assert (tmp_path / "run" / "robot").is_dir()
+
+
 @pytest.mark.slow
 def test_a_refused_run_changes_nothing_of_the_one_that_is_there(tmp_path):
-    def train(*arguments, status=1):
-        return in_a_process("train.py", *arguments, status=status)
-
+    train = partial(in_a_process, "train.py", status=1)
     run, new = tmp_path / "run", (*SMALL, f"hydra.run.dir={tmp_path / 'new'}")
     train(*SMALL, f"hydra.run.dir={run}", "frames=80", status=0)
 
