@@ -132,8 +132,8 @@ class Trial:
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
             own = {k: float(d) for k, d in self.config.cost_limits.items() if k in env.cost_keys}
             limits = own | check_cost_limits(options.cost_limits, env.cost_keys)
+            policy = self.policy(env)  # before an earlier recording is removed: it may not fit
             recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
-            policy = self.policy(env)
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,

@@ -18,7 +18,7 @@ from safe_rl.evaluation.variations import Variation, varied
     [
         (["env.hazard_num=3"], "hazards_num"),
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
-        (["env.lidar_num_bins=8"], "trained on other observations"),
+        (["env.lidar_num_bins=8", "record=true"], "trained on other observations"),
         (["variations=sensing", "record=true"], "cannot be combined with video=true"),
         (["variations=dynamic"], "Did you mean 'dynamics'"),
         (["variations=nowhere.yaml"], "No such file or directory: 'nowhere.yaml'"),
@@ -27,10 +27,7 @@ from safe_rl.evaluation.variations import Variation, varied
         (["variations={noise: {transforms.sensor_noise: 2}}"], "must have keys of the environment"),
         (["variations={noise: {transforms.sensor_nois.std: 2}}"], "Did you mean 'sensor_noise'"),
         (["variations={heavy: {env.mas_scale: 2}}", "episodes=1"], "Did you mean 'mass_scale'"),
-        (
-            ["variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}"],
-            "one of them with a list at most",
-        ),
+        (["variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}"], "one of them with a"),
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "ending in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
@@ -44,10 +41,13 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, m
         skip_without_opengl()
         # before any episode
         monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
+    (run / "evaluation.transitions").mkdir()
+    (run / "evaluation.transitions" / "00000000.pt").touch()
     assert main([str(run), *arguments]) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert error.startswith("error: ")
     assert message in error
+    assert (run / "evaluation.transitions" / "00000000.pt").exists()
 
 
 @pytest.mark.parametrize(
