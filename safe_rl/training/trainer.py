@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from signal import Signals
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDictBase
@@ -213,7 +214,8 @@ class Trainer:
                 self.record.add(row)
                 self._keep(self._candidates.add(row))
                 answers = [callback(row) for callback in self.callbacks]
-                if any(answer is False for answer in answers):
+                # also the False of NumPy
+                if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
                     break
                 if stop.received:  # checked after an epoch: every run has at least one
                     break
