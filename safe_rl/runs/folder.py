@@ -20,6 +20,8 @@ from filelock import FileLock, Timeout
 from safe_rl.files import check_no_links
 
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
+# the end of the name of a run's folder, as commands make it: date, seed, number of a repetition
+_OF_SEED = re.compile(r"(^\d{4}-[\d_-]+)?seed\d+(_\d+)?$")
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
 
@@ -186,22 +188,25 @@ def run_of(source: Path) -> tuple[Path, int | None]:
 
 
 def common_source(source: str) -> str:
-    """The part of ``init_from`` that all seeds share, if each starts from its own run.
+    """The part of ``init_from`` that all seeds share; a folder without a seed in its name stays.
 
     Examples:
-        >>> common_source("runs/small/seed3")
+        >>> common_source("runs/small/seed3"), common_source("runs/small_seed3")
+        ('runs/small', 'runs/small_*')
+        >>> common_source("runs/small")
         'runs/small'
         >>> common_source("runs/small/seed3/checkpoints/best/checkpoint-000000003000.torchrl")
         'runs/small/*/checkpoints/best'
     """
     path = Path(source)
     folder, steps = run_of(path)
+    shared = folder.parent / _OF_SEED.sub("*", folder.name)
     if steps is None:
-        return str(folder.parent)
+        return str(folder.parent if shared.name == "*" else shared)
     checkpoint = path.relative_to(folder)
     # the steps of the best one differ between seeds
     is_best = checkpoint.parent.name == "best"
-    return str(folder.parent / "*" / (checkpoint.parent if is_best else checkpoint))
+    return str(shared / (checkpoint.parent if is_best else checkpoint))
 
 
 class RunInUseError(ValueError):

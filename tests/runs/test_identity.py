@@ -97,9 +97,12 @@ def test_everything_else_does(override):
 
 
 def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
-    sources = [f"init_from=runs/small/seed{seed}" for seed in (0, 10)]
-    first, second = (experiment_of(as_saved(source)) for source in sources)
-    assert first == second != experiment_of(as_saved("init_from=runs/large/seed0"))
+    for pattern in ("small/seed{}", "small/2026-01-3{0}_12-0{0}-00_seed{0}_2", "small_seed{}"):
+        sources = [f"init_from=runs/{pattern.format(seed)}" for seed in (0, 1)]
+        first, second = (experiment_of(as_saved(source)) for source in sources)
+        assert first == second != experiment_of(as_saved("init_from=runs/large/seed0"))
+    one, other = (experiment_of(as_saved(f"init_from=runs/{name}")) for name in ("goal1", "goal2"))
+    assert one != other
 
 
 def test_a_sweep_continues_an_archived_run_that_lacks_the_kind_of_physics():
