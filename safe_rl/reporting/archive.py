@@ -180,6 +180,7 @@ def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     rows = pandas.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
-        # before its first episode has ended, a run has no number in these
-        always = own.columns.isin(["episode_return", "episode_cost"])
-        yield name, own.loc[:, always | own.notna().any()].to_dict("list")
+        known = own.columns[own.notna().any()]
+        # before its first episode has ended, a run has no number in the first two
+        kept = ["episode_return", *(f"episode_{c.removesuffix('_rate')}" for c in known), *known]
+        yield name, own.loc[:, own.columns.isin(kept)].to_dict("list")
