@@ -58,8 +58,11 @@ def compose_jobs(
     """
     overrides = [parse(text) for text in texts]
     _check_form(overrides)
-    if sweep and any(override.key_or_group == "hydra.run.dir" for override in overrides):
+    given = [override.key_or_group for override in overrides]
+    if sweep and "hydra.run.dir" in given:
         raise CommandLineError("hydra.run.dir is for a single run: write hydra.sweep.dir with -m.")
+    if not (sweep or shown) and "hydra.sweep.dir" in given:
+        raise CommandLineError("hydra.sweep.dir is for a sweep: add -m, or write hydra.run.dir.")
     with hydra_on_conf():
         jobs = list(_jobs(overrides)) if sweep else [list(texts)]
         configs = [_compose(job) for job in jobs]

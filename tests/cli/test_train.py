@@ -47,6 +47,7 @@ def test_configurations_are_shown(command):
         (["-m", "seed=0,abc"], "seed=abc: it must be a whole number"),
         (["-m", "slate=SG6", "env=CarGoal1"], "slate=SG6 chooses the environments: leave out env="),
         (["hydra.run.dir=/proc/runs"], "/proc/runs"),
+        (["hydra.sweep.dir=mine"], "hydra.sweep.dir is for a sweep: add -m"),
         (["init_from=nowhere"], "init_from=nowhere: there is no such folder or file."),
     ],
 )
