@@ -55,7 +55,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     for form in formats:
         if form not in FORMATS:
             raise ValueError(f"formats={form}: pictures are written as {', '.join(FORMATS)}.")
-    out = root / "report" if options.out is None else Path(options.out)
+    out = root / "report" if options.out is None else Path(options.out).expanduser()
     if options.out is None and out.is_symlink():
         raise ValueError(f"{out} is a link: remove it, or give out=FOLDER.")
     if root.is_dir():
@@ -70,7 +70,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     )
     page = write_report(result, out, options.title or root.resolve().name, formats)
     if options.archive is not None:
-        archive_runs(result.runs, root, Path(options.archive))
+        archive_runs(result.runs, root, Path(options.archive).expanduser())
     return result, page
 
 
