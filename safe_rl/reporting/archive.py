@@ -119,8 +119,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     """Add runs to an archive, or update them there; their names are their paths below ``root``.
 
     Raises:
-        ValueError: If one folder lies in the other, the archive is none, or it has another run of
-            one of these names.
+        ValueError: If one folder lies in the other, or the archive is none or has other such runs.
         OSError: If it cannot be read or written.
     """
     here, there = root.resolve(), archive.resolve()

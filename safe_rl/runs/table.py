@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from safe_rl.files import read_bounded, replace_text
@@ -19,7 +20,7 @@ class TableError(ValueError):
     """A table that is not as its run has written it."""
 
 
-class TableWriter:
+class TableWriter(AbstractContextManager["TableWriter"]):
     """Append rows of numbers to a CSV file; the first row fixes the columns.
 
     Every row is flushed. NaN becomes an empty field. Numbers are written so that they read back
@@ -73,9 +74,6 @@ class TableWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
-
-    def __enter__(self) -> TableWriter:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()

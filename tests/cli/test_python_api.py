@@ -325,14 +325,8 @@ def test_a_run_shows_itself(tmp_path):
 
 def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
     seen = []
-
-    def stop_early(row):
-        seen.append(row["steps"])
-        return np.mean(row["steps"]) < 80
-
-    run = safe_rl.train(
-        "PointGoal1", directory=tmp_path, frames=400, callbacks=[stop_early, len], **SMALL
-    )
+    early = [lambda row: seen.append(row["steps"]), lambda row: np.mean(row["steps"]) < 80, len]
+    run = safe_rl.train("PointGoal1", directory=tmp_path, frames=400, callbacks=early, **SMALL)
     assert seen == run.table["steps"] == [40, 80]
     run = safe_rl.resume(tmp_path, frames=400, callbacks=[lambda row: row["steps"] < 120])
     assert run.table["steps"] == [40, 80, 120]

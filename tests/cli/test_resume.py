@@ -122,10 +122,8 @@ def test_folders_of_configurations_and_modules_may_stay_in_the_command(run, tmp_
 def test_what_ray_is_started_with_is_not_taken_from_a_file(run):
     path = run / "config.yaml"
     local = path.read_text().replace("collector:\n", "collector:\n  ray_init: {address: null}\n")
-    local = local.replace(
-        "_target_: null\n  num_collectors",
-        "_target_: safe_rl.collectors.make_ray_collector\n  num_collectors",
-    )
+    on_ray = "_target_: safe_rl.collectors.make_ray_collector\n  num_collectors"
+    local = local.replace("_target_: null\n  num_collectors", on_ray)
     path.write_text(local.replace("null}", "far}"))
     with pytest.raises(CommandLineError, match=r"again, collector\.ray_init\.address="):
         compose_resumed(run, [])

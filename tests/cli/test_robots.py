@@ -66,9 +66,8 @@ def run(tmp_path, monkeypatch):
 
 
 def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation_nor_its_policy(run, tmp_path):
-    whole, folder = run("whole", frames=80), run()
-    assert export.main([str(folder), str(policy := tmp_path / "policy")]) == 0
-    rows = []
+    whole, folder, policy, rows = run("whole", frames=80), run(), tmp_path / "policy", []
+    assert export.main([str(folder), str(policy)]) == 0
     for place in (folder, folder, policy):
         assert evaluate.main([str(place), "episodes=2", "num_threads=1"]) == 0
         rows.append((place / "evaluation.csv").read_text())
@@ -77,9 +76,8 @@ def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation_nor_its_poli
     assert train.main([f"resume={folder}", "frames=80"]) == 0
     assert without_times(folder / "progress.csv") == without_times(whole / "progress.csv")
     # the name of the robot, by which runs are told apart, stays
-    assert yaml.safe_load((folder / "config.yaml").read_text())["env"]["robot_base"] == (
-        "robot/ball.xml"
-    )
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["env"]["robot_base"] == "robot/ball.xml"
 
 
 def test_a_robot_in_the_place_of_its_copy_is_kept(run, tmp_path):
