@@ -144,6 +144,9 @@ def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
 
 def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
     flat = flatten(config)
+    transforms = config.get("transforms") or {}
+    if len(transforms) > 1:
+        flat["transforms"] = tuple(transforms)  # their order
     return {key: value for key, value in flat.items() if (key, value) not in _SILENT.items()}
 
 

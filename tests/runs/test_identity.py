@@ -96,6 +96,12 @@ def test_everything_else_does(override):
     assert experiment_of(as_saved(override)) != experiment_of(as_saved())
 
 
+def test_the_order_of_transforms_does():
+    orders = ("saute,sensor_noise", "sensor_noise,saute")
+    first, second = (experiment_of(as_saved(f"transforms=[{names}]")) for names in orders)
+    assert first != second
+
+
 def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
     for pattern in ("small/seed{}", "small/2026-01-3{0}_12-0{0}-00_seed{0}_2", "small_seed{}"):
         sources = [f"init_from=runs/{pattern.format(seed)}" for seed in (0, 1)]
