@@ -102,8 +102,8 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         ...
         safe_rl.targets.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
     """  # noqa: E501
-    shown = f"{key}={target}" if key else f"{target}"
-    name = str(target)
+    name = " ".join(str(target).split())  # in one line, as messages show it
+    shown = f"{key}={name}" if key else name
     # the user's modules come first: they may contain a room with fewer names
     root = next((room for room in reversed(_ROOMS) if name.startswith(f"{room}.")), None)
     if root is None:

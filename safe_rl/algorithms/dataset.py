@@ -34,9 +34,9 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             environment, lack an entry or are not finite; if no episode is within the limits, or
             the replay buffer is too small.
     """
-    node = config.get("dataset")
-    if node is None or node.path is None:
-        if node is not None and node.alone:
+    node = config.get("dataset") or {}
+    if node.get("path") is None:
+        if node.get("alone"):
             raise ValueError(
                 f"dataset.path is missing: algo={config.algo.name} with dataset.alone=true learns "
                 "from nothing else. Give the folder of a recording (record=true), or an HDF5 file."

@@ -89,9 +89,13 @@ class ReplayUpdate(Checked):
         self.optimizer = optimizer(_groups(loss, rates or {}))
         self._parameters = list(loss.parameters())
         self._device = self._parameters[0].device
-        # SoftUpdate equates the targets, and refuses losses without them; its own steps are slow
-        self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         pairs = loss.target_pairs()
+        if tau is not None and not pairs:
+            raise ValueError(
+                f"tau={tau}: {type(loss).__name__} has no target networks: set it to null."
+            )
+        # SoftUpdate equates the targets; its own steps are slow
+        self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         self._targets = [target.data for target, _ in pairs]
         self._sources = [source.data for _, source in pairs]
         if pairs and tau is None:

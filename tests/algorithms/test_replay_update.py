@@ -10,7 +10,7 @@ from torchrl.data import Bounded
 
 from safe_rl.algorithms import Memory, PolicyUpdate, ReplayUpdate
 from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
-from safe_rl.objectives import SACLoss, TD3Loss
+from safe_rl.objectives import BCLoss, SACLoss, TD3Loss
 
 
 def make_update(seed, tau=0.1, **keys):
@@ -108,6 +108,9 @@ def test_a_checkpoint_of_before_the_first_update_is_whole(memory):
 def test_targets_that_would_never_move_and_other_losses_are_refused():
     with pytest.raises(ValueError, match="tau is null, but SACLoss has target networks"):
         make_update(0, tau=None)
+    cloning = BCLoss(make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
+    with pytest.raises(ValueError, match="BCLoss has no target networks: set it to null"):
+        ReplayUpdate(cloning, optimizer=torch.optim.Adam, updates_per_step=1, tau=0.1)
     with pytest.raises(TypeError, match=r"Linear is no loss on a replay buffer.*ReplayLoss"):
         ReplayUpdate(torch.nn.Linear(1, 1), optimizer=torch.optim.Adam, updates_per_step=1, tau=0.1)
 

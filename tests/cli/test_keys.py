@@ -14,11 +14,14 @@ from run_configs import CONF, compose_config
 import safe_rl.objectives
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.cli.schema import KEYS, check_settings, plain
+from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
 from safe_rl.parameters import read_part
 from safe_rl.ranges import ANYTHING
 
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
+# last, because it is refused without a dataset, whatever other keys have
+ALGORITHMS.append(ALGORITHMS.pop(ALGORITHMS.index("bc")))
 # what recipes, collectors and run folders hand to a part themselves
 LIVE = {
     *("self", "loss", "actor_network", "multiplier", "value_network", "cost_keys", "cost_limits"),
@@ -102,7 +105,7 @@ def outcome(config: Any, path: str, value: Any) -> str:
         return str(error)
     try:
         find_recipe(changed).build(changed, PointMass(2))
-    except ValueError as error:  # what parts have to say about two keys together
+    except SETTING_ERRORS as error:  # what parts have to say about two keys together
         return " ".join(str(error).split())
     return ""
 
