@@ -34,7 +34,7 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             environment, lack an entry or are not finite; if no episode is within the limits, or
             the replay buffer is too small.
     """
-    node = config.get("dataset") or {}
+    node = config.get("dataset") or DictConfig({})
     if node.get("path") is None:
         if node.get("alone"):
             raise ValueError(
