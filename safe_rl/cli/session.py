@@ -167,10 +167,13 @@ class Session:
         taken = next((place for place in places if place.exists()), None)
         if not self._continues and taken is not None:
             key = "hydra.run.dir" if self._program else "directory"
-            what = "a run" if folder.has_begun else f"a run or its {taken.name}"
+            if not folder.has_begun:
+                raise FileExistsError(
+                    f"The run would replace {taken}: give it another folder, {key}=…"
+                )
             raise FileExistsError(
-                f"{folder.directory} already holds {what}. Continue it with: {self._again}; or "
-                f"give this one another folder, {key}=…"
+                f"{folder.directory} already holds a run. Continue it with: {self._again}; or give "
+                f"this one another folder, {key}=…"
             )
         if self._continues and is_finished(folder.directory, config.frames):
             more = ": raise 'frames' to train on"

@@ -22,7 +22,7 @@ from safe_rl.files import read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.recorded import Run, read_certificate, read_code, read_evaluation, select
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import RunFolder, paths_below, runs_below
-from safe_rl.runs.identity import differences
+from safe_rl.runs.identity import differences, role_of
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -128,7 +128,9 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     kept = read_archive(archive) if (archive / RUNS).exists() else {}
     names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
     for name in kept.keys() & names:
-        if found := differences(kept[name].config, names[name].config):
+        differing = differences(kept[name].config, names[name].config)
+        # what `resume=` may change makes no other run
+        if found := [key for key in differing if not role_of(key).may_change]:
             raise ValueError(
                 f"archive={archive}: its run {name} is another one than that in {root}: they "
                 f"differ in {', '.join(found)}. Give another folder for these runs."

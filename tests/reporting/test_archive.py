@@ -64,6 +64,8 @@ def test_an_archive_follows_runs_that_go_on_and_is_the_same_bytes_otherwise(runs
         assert [path.read_bytes() for path in sorted(folder.iterdir())] == first
     with (run / "progress.csv").open("a") as file:
         file.write("4,4000,1,3.0,10.0,0.02,14.4,7\n")
+    with (run / "config.yaml").open("a") as file:  # `resume=` may change it
+        file.write("lagrangian: {kp: 0.5}\n")
     # one of them alone: the others stay
     archive_runs([r for r in find_runs(runs)[0] if r.directory == run], runs, kept)
     again = read_archive(kept)

@@ -284,4 +284,4 @@ def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
     build_trainer(config, PointMass(4, 20), tmp_path).run()
     table = read_table(tmp_path / "progress.csv")
     assert sum(table["episode_return"][-20:]) / 20 > 0.9
-    assert sum(table["episode_cost"][-20:]) / 20 < 2.5  # half of what the straight way costs
+    assert sum(table["episode_cost"][-20:]) / 20 < 1.5
