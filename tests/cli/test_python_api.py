@@ -248,10 +248,15 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     page = safe_rl.report(run.directory, out="~/page", archive="~/kept")
     assert {page.parent, Path("~/kept").expanduser()} <= {*run.directory.parent.iterdir()}
     monkeypatch.setenv("HOME", str(tmp_path))
-    (tmp_path / "taken").mkdir()
-    for name in ("config.yaml", "progress.csv"):  # the first may be the user's own
-        (tmp_path / "taken" / name).touch()
-        with pytest.raises(FileExistsError, match=rf"resume\('{tmp_path}/taken'\)"):
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    refusals = {
+        "config.yaml": rf"would replace {taken}/conf",
+        "progress.csv": rf"resume\('{taken}'\)",
+    }
+    for name, words in refusals.items():  # the first may be the user's own
+        (taken / name).touch()
+        with pytest.raises(FileExistsError, match=words):
             safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
 
 
