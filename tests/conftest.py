@@ -6,6 +6,11 @@ import safe_rl  # noqa: F401, has to come before torch
 
 # isort: split
 import torch
+from hypothesis import settings
+
+# the same examples in each run, and no deadlines: these depend on the machine
+settings.register_profile("repeatable", deadline=None, derandomize=True)
+settings.load_profile("repeatable")
 
 # as many processes as cores run tests: a second thread in each would only be in the way
 torch.set_num_threads(1)

@@ -21,7 +21,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(config=st.dictionaries(st.text("abc", min_size=1), VALUES))
 def test_what_a_run_saves_is_read_back(config, tmp_path_factory):
     path = tmp_path_factory.mktemp("run") / "config.yaml"

@@ -9,11 +9,8 @@ from hypothesis import strategies as st
 from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.config_keys import Vocabulary
 
-# Deterministic, so that no run depends on luck; without deadlines, which depend on the machine.
 often = settings(
     max_examples=100,
-    deadline=None,
-    derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 
