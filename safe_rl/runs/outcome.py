@@ -62,20 +62,10 @@ def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
     return violation(row, key, limit) <= 0 and estimate <= target
 
 
-def mean_row(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Means of several epochs, by column, over the epochs in which the column has a number.
-
-    Examples:
-        >>> mean_row([{"episode_cost": 20.0}, {"episode_cost": math.nan}, {"episode_cost": 30.0}])
-        {'episode_cost': 25.0}
-    """
-    columns: dict[str, list[float]] = {}
-    for row in rows:
-        for name, value in row.items():
-            columns.setdefault(name, [])
-            if not math.isnan(value):
-                columns[name].append(value)
-    return {name: fmean(values) if values else math.nan for name, values in columns.items()}
+def _mean_of_known(values: Iterable[float]) -> float:
+    """Mean of the numbers among values; NaN if there is none."""
+    known = [value for value in values if not math.isnan(value)]
+    return fmean(known) if known else math.nan
 
 
 def feasible_return(
@@ -91,7 +81,7 @@ def feasible_return(
         >>> feasible_return(rows, {"cost": 25.0}), feasible_return(rows[:1], {"cost": 25.0})
         (5.0, None)
     """
-    mean = mean_row(latest)
+    mean = {name: _mean_of_known(row[name] for row in latest) for name in latest[0]}
     is_feasible = all(keeps(mean, key, limit) for key, limit in limits.items())
     score = mean["episode_return"]
     return score if is_feasible and not math.isnan(score) else None
@@ -147,8 +137,8 @@ def final_figures(
     """
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]
     names = ["episode_return", *(name for name in costs if name in table)]
-    rows = ({name: table[name][row] for name in names} for row in final_rows(table))
-    final = dict.fromkeys(names, math.nan) | mean_row(rows)
+    rows = final_rows(table)
+    final = {name: _mean_of_known(table[name][row] for row in rows) for name in names}
     final |= {f"{key}_rate": table[f"{key}_rate"][-1] for key in cost_keys}
     final["steps_per_second"] = table["steps"][-1] / table["time_total"][-1]
     return final
