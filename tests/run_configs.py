@@ -9,7 +9,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 
+from safe_rl.envs import store_configs
 from safe_rl.files import CONF
+
+store_configs()
 
 # what the benchmark's environments have and the point mass lacks, a configuration by name
 ConfigStore.instance().store(

@@ -14,9 +14,7 @@ from safe_rl.algorithms import OffPolicy, OnPolicy
 from safe_rl.algorithms.build_part import find_recipe
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
-from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, registration, store_configs
-
-store_configs()
+from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, registration
 
 
 def options(group: str) -> list[str]:
@@ -226,14 +224,9 @@ SIZES = {
     "DoggoButton1": (100_000_000, 60, 60_000),
 }
 # what is no part of the algorithm, and the tables that other keys read
-ASIDE = {"collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"}
-ASIDE |= {
-    "certificate",
-    "checkpoint",
-    "default_cost_limits",
-    "import",
-    "paper",
-    "record",
+ASIDE = {
+    *("collector", "env", "algo", "preset", "logger", "seed", "device", "num_threads", "compile"),
+    *("certificate", "checkpoint", "default_cost_limits", "import", "paper", "record"),
     "transforms",
 }
 

@@ -21,7 +21,7 @@ import safe_rl
 from safe_rl.cli.composing import compose_jobs, search_folders
 from safe_rl.cli.grammar import overrides_of
 from safe_rl.cli.python_api import _WHOLE
-from safe_rl.envs import ConfigError, store_configs
+from safe_rl.envs import ConfigError
 from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.archive import archive_runs, find_runs
 from safe_rl.runs.table import read_table
@@ -269,7 +269,6 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     ],
 )
 def test_mappings_take_the_place_of_what_is_none(algo, key, value):
-    store_configs()
     given = {"algo": algo, "transforms": ["saute"], key: value}
     (config,) = compose_jobs(list(overrides_of(given, _WHOLE)))
     assert OmegaConf.select(config, key) == value

@@ -11,7 +11,7 @@ from run_configs import compose_config
 
 pytest.importorskip("mujoco_warp")
 
-from safe_rl.envs import ConfigError, SafetyGymEnv, make_env, store_configs
+from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
@@ -135,7 +135,6 @@ def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
 
 def looks_of_an_epoch(directory, num_steps, algo):
     """How often one epoch looks at values: a rollout, advantages and costs, and the updates."""
-    store_configs()
     own = {  # as many gradient steps of PPO, whatever they change
         "ppo_lagrangian": [
             f"critic_update.minibatch_size={2 * num_steps}",

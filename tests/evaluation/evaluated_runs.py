@@ -4,7 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
-from safe_rl.envs import OpenGLError, make_env, store_configs
+from safe_rl.envs import OpenGLError, make_env
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -13,7 +13,6 @@ NUM_STEPS = 40
 
 def train(directory, *overrides):
     """A run of two epochs on PointGoal1 with short episodes."""
-    store_configs()
     config = compose_config(
         "env=PointGoal1",
         f"env.num_steps={NUM_STEPS}",

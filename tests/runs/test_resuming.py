@@ -17,7 +17,7 @@ from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.envs import SafetyGymEnv, store_configs
+from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunFolder, RunInUseError
 from safe_rl.runs.identity import check_same_run
@@ -25,8 +25,6 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
-
-store_configs()
 
 # episodes of 45 steps are open at the end of epochs of 30
 SMALL = [
