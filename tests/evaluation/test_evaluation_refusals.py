@@ -96,11 +96,6 @@ def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, m
     assert "error: mine was asked for 25" in capsys.readouterr().err
 
 
-def test_a_folder_above_runs_names_them(run, capsys):
-    assert main([str(run.parent)]) == 1
-    assert f"Runs below it: {run}" in capsys.readouterr().err
-
-
 def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
     shutil.rmtree(run / "checkpoints" / "best")
     assert main([str(run), "checkpoint=best"]) == 1

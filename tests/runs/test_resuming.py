@@ -189,18 +189,6 @@ def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
     assert steps == [120.0 * (i + 1) for i in range(len(steps))]
 
 
-def test_a_longer_run_resumes_from_the_end(tmp_path):
-    point_mass_trainer(tmp_path, "frames=640").run()
-    assert is_finished(tmp_path, 640)
-    assert not is_finished(tmp_path, 641)
-    longer = point_mass_trainer(tmp_path, "frames=960")
-    longer.resume()
-    assert longer.progress.steps == 640
-    longer.run()
-    assert read_table(tmp_path / "progress.csv")["steps"] == [160.0 * i for i in range(1, 7)]
-    assert OmegaConf.load(tmp_path / "config.yaml").frames == 960
-
-
 def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     paper = "limits=paper"  # a descent would depend on the frames of a run
     point_mass_trainer(tmp_path / "whole", paper).run()
@@ -216,15 +204,6 @@ def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     trainer.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("run", "whole")]
     assert tables[0] == tables[1]
-
-
-def test_a_foreign_checkpoint_is_refused_and_touches_nothing(tmp_path):
-    point_mass_trainer(tmp_path / "wide", "model.hidden_sizes=[32]").run()
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    trainer = point_mass_trainer(tmp_path / "wide")
-    with pytest.raises(CheckpointError, match="size mismatch"):
-        trainer.resume()
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_a_table_that_lacks_epochs_is_refused(tmp_path):
