@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Schema = TypeVar("Schema", bound="DataclassInstance")
-IMPORT = "import"
-"""The key that names the user's modules."""
 
 
 class CommandLineError(ValueError):
@@ -65,11 +63,11 @@ def split_imports(arguments: Sequence[str]) -> tuple[list[str] | None, list[str]
     Returns:
         The modules, or None if ``import=`` is not given; and the other arguments.
     """
-    given, others = take_word(IMPORT, arguments)
+    given, others = take_word("import", arguments)
     modules: list[str] = []
     for text in given:
         is_list = text.startswith("[")
-        modules += cast(list[str], parse(f"{IMPORT}={text}").value()) if is_list else [text]
+        modules += cast(list[str], parse(f"import={text}").value()) if is_list else [text]
     return (list(dict.fromkeys(modules)) if given else None), others
 
 

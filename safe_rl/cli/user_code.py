@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl import targets
-from safe_rl.cli.grammar import IMPORT, CommandLineError, overrides_of
+from safe_rl.cli.grammar import CommandLineError, overrides_of
 
 _imported: list[str] = []
 
@@ -25,7 +25,7 @@ def note_imports(modules: str | Sequence[str] | None) -> list[str]:
     if modules is None:
         return []
     listed = list(modules) if isinstance(modules, list | tuple) else [modules]
-    return list(overrides_of({f"++{IMPORT}": listed}))
+    return list(overrides_of({"++import": listed}))
 
 
 def import_modules(modules: str | Sequence[str] | None) -> None:
@@ -45,7 +45,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
             path = Path(module).expanduser()
             name = path.stem
             if not path.is_file():
-                raise CommandLineError(f"{IMPORT}={module}: there is no such file.")
+                raise CommandLineError(f"import={module}: there is no such file.")
         # the folder is added to the path: other processes import the module by its name
         folder = str(Path.cwd() if name == module else path.resolve().parent)
         if folder not in sys.path:
@@ -53,7 +53,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
         found = _import(name, module)
         if path.is_file() and Path(found).resolve() != path.resolve():
             raise CommandLineError(
-                f"{IMPORT}={module}: Python has another module of that name, {found}. Rename yours."
+                f"import={module}: Python has another module of that name, {found}. Rename yours."
             )
         targets.allow(name)
         where = module if name == module else str(path.resolve())
@@ -73,12 +73,12 @@ def _import(name: str, given: str) -> str:
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
             raise CommandLineError(
-                f"{IMPORT}={given}: there is no module '{error.name}' here or among the installed "
-                f"ones. A file is named by its path: {IMPORT}=folder/{error.name}.py."
+                f"import={given}: there is no module '{error.name}' here or among the installed "
+                f"ones. A file is named by its path: import=folder/{error.name}.py."
             ) from None
         *_, last = traceback.extract_tb(error.__traceback__)
         raise CommandLineError(
-            f"{IMPORT}={given}: {type(error).__name__}: {error} "
+            f"import={given}: {type(error).__name__}: {error} "
             f"({last.filename}, line {last.lineno})."
         ) from error
 
@@ -91,10 +91,10 @@ def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **optio
 
 def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:
     """Refuse to open a run that has used modules of its own, unless ``import=`` is given."""
-    noted = config.get(IMPORT) or []
+    noted = config.get("import") or []
     if given is None and noted:
-        words = " ".join(f"{IMPORT}={module}" for module in noted)
+        words = " ".join(f"import={module}" for module in noted)
         raise CommandLineError(
             f"{run} was trained with {words}: add that to the command if you trust this code, or "
-            f"'{IMPORT}=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
+            f"'import=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
         )
