@@ -104,8 +104,6 @@ class CheckpointStore:
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
         self._run = dict(run or {})
-        # former best checkpoints: needed again if the run is resumed from its last checkpoint
-        self._displaced: set[Path] = set()
 
     def begin(self) -> None:
         """Note that a run begins and has no checkpoint yet."""
@@ -124,9 +122,7 @@ class CheckpointStore:
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
             old.unlink()
         self._none_yet.unlink(missing_ok=True)
-        for displaced in self._displaced:
-            displaced.unlink(missing_ok=True)
-        self._displaced.clear()
+        self._remove_worse()
         return path
 
     def save_best(
@@ -155,16 +151,17 @@ class CheckpointStore:
         if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
             return False
         states = states_of(self._components) if states is None else states
-        path = self._write(self.best, steps, {**(facts or {}), "score": score}, states)
-        others = [other for other in checkpoints_in(self.best) if other != path]
-        others.sort(key=_score, reverse=True)
-        newest = max((saved.name for saved in checkpoints_in(self.last)), default="")
-        for worse in others[self._keep_best - 1 :]:
-            if worse.name > newest:
-                worse.unlink()
-            else:
-                self._displaced.add(worse)
+        self._write(self.best, steps, {**(facts or {}), "score": score}, states)
+        last = checkpoints_in(self.last)
+        self._remove_worse(after=last[-1].name if last else "")
         return True
+
+    def _remove_worse(self, after: str = "") -> None:
+        """Remove the best checkpoints beyond ``keep_best`` that are newer than a named one."""
+        ranked = sorted(checkpoints_in(self.best), key=_score, reverse=True)
+        for worse in ranked[self._keep_best :]:
+            if worse.name > after:
+                worse.unlink()
 
     def forget_best(self, steps: Iterable[int]) -> None:
         """Remove the best checkpoints, if any, with these numbers of environment steps."""
