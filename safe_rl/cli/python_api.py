@@ -101,7 +101,7 @@ def train(
     words += [f"--config-dir={place}" for place in folders]
     (config,) = read_command([*words, *note_imports(imports or None)]).configs
     folder = None if directory is None else Path(directory).expanduser()
-    return _carry_out(Session.begin(config, folder, program=None, callbacks=callbacks))
+    return _carry_out(Session(config, folder, program=None, callbacks=callbacks))
 
 
 def resume(

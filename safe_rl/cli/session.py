@@ -51,11 +51,10 @@ class Session:
     """One run in its folder: begun or continued, trained, certified.
 
     Args:
-        config: Its configuration, checked.
-        folder: Its folder.
-        hydra: The node ``hydra``, which a new run writes into its notes.
+        config: Its configuration, checked. Its node ``hydra``, if any, is removed; a new run writes
+            it into its notes.
+        folder: Its folder; None: the one that its configuration names.
         continues: Whether to continue the run in the folder.
-        is_new: Whether the folder did not exist before. It is removed if the run cannot begin.
         program: The command, as the user has called it; None: Python, where the outcome is not
             printed.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
@@ -64,17 +63,22 @@ class Session:
     def __init__(
         self,
         config: DictConfig,
-        folder: Path,
-        hydra: DictConfig | None = None,
+        folder: Path | None = None,
         *,
         continues: bool = False,
-        is_new: bool = False,
         program: str | None = "python train.py",
         callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = (),
     ) -> None:
-        self.config, self.folder, self.hydra = config, RunFolder(folder), hydra
-        self._continues, self._is_new, self._callbacks = continues, is_new, callbacks
-        self._program = program
+        # a new folder is removed if the run cannot begin
+        if folder is None:
+            with resolving(config):
+                folder, self._is_new = new_folder(config.hydra)
+        else:
+            self._is_new = not folder.exists()
+        with open_dict(config):
+            self.hydra = config.pop("hydra", None)
+        self.config, self.folder = config, RunFolder(folder)
+        self._continues, self._callbacks, self._program = continues, callbacks, program
         modules = list(config.get("import") or [])
         self._imports = "".join(f" import={quote(name)}" for name in modules)
         self._again = f"{program}{self._imports} resume={quote(str(folder))}"
@@ -82,21 +86,6 @@ class Session:
             imports = f", imports={modules}" if modules else ""
             self._again = f"safe_rl.resume({str(folder)!r}{imports})"
         self._has_begun = False
-
-    @classmethod
-    def begin(cls, config: DictConfig, folder: Path | None = None, **options: Any) -> Session:
-        """Begin a new run, in the folder that its configuration names unless one is given.
-
-        The configuration is as `compose_jobs` returns it; its node ``hydra`` is removed.
-        """
-        if folder is None:
-            with resolving(config):
-                folder, is_new = new_folder(config.hydra)
-        else:
-            is_new = not folder.exists()
-        with open_dict(config):
-            hydra = config.pop("hydra")
-        return cls(config, folder, hydra, is_new=is_new, **options)
 
     def run(self) -> None:
         """Train, or continue to train; at the end, certify a run that is to keep limits.
@@ -287,7 +276,9 @@ def run_job(config: DictConfig, hydra: DictConfig) -> float:
     folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
     check_risk(config)  # for this combination of a sweep's values
-    Session(config, folder.directory, hydra, continues=True).run()
+    with open_dict(config):
+        config.hydra = hydra
+    Session(config, folder.directory, continues=True).run()
     limits = dict(config.cost_limits)
     figures = final_figures(read_table(folder.table), list(limits))
     value = figures["episode_return"]

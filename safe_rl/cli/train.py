@@ -120,10 +120,8 @@ def main(arguments: Sequence[str] | None = None, program: str = "python train.py
         from safe_rl.cli.session import Session
 
         (config,) = command.configs
-        if command.run is None:
-            session = Session.begin(config, program=program)
-        else:
-            session = Session(config, command.run, continues=True, program=program)
+        run = command.run
+        session = Session(config, run, continues=run is not None, program=program)
         session.run()
     except Exception as error:
         is_about_words = isinstance(error, ValueError | HydraException | OSError)
