@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -92,22 +92,6 @@ class Trial:
         seed = self.options.seed
         return default_seed(self.node, self.config.seed) if seed is None else seed
 
-    def facts(self, limits: Mapping[str, float], cost_keys: Collection[str]) -> dict[str, Any]:
-        """What is evaluated, how, and the limits; limits on missing costs are listed apart."""
-        return {
-            "environment": self.node.get("name", ""),
-            "algorithm": self.config.algo.name,
-            "checkpoint_file": str(self.checkpoint),
-            "steps": checkpoint_steps(self.checkpoint),
-            "interval_level": LEVEL,
-            **asdict(self.options),
-            "seed": self.seed,
-            "cost_limits": dict(limits),
-            "limits_without_cost": {
-                key: float(d) for key, d in self.config.cost_limits.items() if key not in cost_keys
-            },
-        }
-
     def make(self, num_envs: int, **keys: Any) -> EnvBase:
         """Make environments, with some keys changed."""
         return for_evaluation(self.make_env, self.config)(
@@ -121,17 +105,20 @@ class Trial:
 
     def run(
         self, *, progress: bool = False, record: Path | None = None
-    ) -> tuple[Episodes, dict[str, float]]:
-        """Run whole episodes; returns them, and the limits on their costs.
+    ) -> tuple[Episodes, dict[str, Any]]:
+        """Run whole episodes; returns them, and the facts: what was evaluated, how, and the limits.
+
+        Limits on costs that the environment lacks are listed apart.
 
         Args:
             progress: Whether to show a bar.
             record: Folder to which all steps are written; None: they are not recorded.
         """
         options = self.options
+        limits = {key: float(limit) for key, limit in self.config.cost_limits.items()}
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
-            own = {k: float(d) for k, d in self.config.cost_limits.items() if k in env.cost_keys}
-            limits = own | check_cost_limits(options.cost_limits, env.cost_keys)
+            unjudged = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
+            limits |= check_cost_limits(options.cost_limits, env.cost_keys)
             policy = self.policy(env)  # before an earlier recording is removed: it may not fit
             recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
             torch.manual_seed(self.seed)
@@ -141,7 +128,17 @@ class Trial:
             )  # fmt: skip
             if recorder is not None:
                 recorder.flush()
-        return episodes, limits
+        return episodes, {
+            "environment": self.node.get("name", ""),
+            "algorithm": self.config.algo.name,
+            "checkpoint_file": str(self.checkpoint),
+            "steps": checkpoint_steps(self.checkpoint),
+            "interval_level": LEVEL,
+            **asdict(options),
+            "seed": self.seed,
+            "cost_limits": limits,
+            "limits_without_cost": unjudged,
+        }
 
     def film(self, file: Path, **drawing: Any) -> None:
         """Write an episode as a film or a picture; ``drawing`` are keys of the environment."""
@@ -199,16 +196,15 @@ def evaluate(
     for film in films:
         with closing(trial.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
-    episodes, limits = trial.run(progress=progress, record=kept[0] if kept else None)
+    episodes, facts = trial.run(progress=progress, record=kept[0] if kept else None)
     reference = suite.reference(trial.node, but_for=_LAYOUTS)
-    estimates = summarise(episodes, limits, reference, options.cvar_alpha)
+    estimates = summarise(episodes, facts["cost_limits"], reference, options.cvar_alpha)
     known = shared_layouts(
         OmegaConf.to_container(config.env),  # type: ignore[arg-type]
         trial.node,
         same_seed=trial.seed == config.seed,
     )
-    facts = {"run": str(directory), "layouts_trained_on": known}
-    facts |= trial.facts(limits, episodes.costs)
+    facts = {"run": str(directory), "layouts_trained_on": known, **facts}
     parts = {name: estimate._asdict() for name, estimate in estimates.items()}
     replace_json(summary, {**facts, "estimates": parts})
     columns = {"return": episodes.returns, "length": episodes.lengths, **episodes.costs}

@@ -168,7 +168,7 @@ class Varied:
     Attributes:
         rows: First the run's own environment, then every variation.
         left_out: Variations that this environment cannot have, and why.
-        facts: What was evaluated in the run's own environment, and how; see `Trial.facts`.
+        facts: What was evaluated in the run's own environment, and how; see `Trial.run`.
         file: The table.
     """
 
@@ -244,14 +244,15 @@ def evaluate_variations(
             if progress:
                 print(f"… {variation}", flush=True)
             trial = Trial(changed, checkpoint, options, make_env)
-            episodes, limits = trial.run()
+            episodes, found = trial.run()
         except ValueError as error:
             if not variation.may_lack:
                 raise
             left_out.append((variation, str(error)))
             continue
-        facts = facts or trial.facts(limits, episodes.costs)
-        rows.append(VariedRow(variation, summarise(episodes, limits, None, options.cvar_alpha)))
+        facts = facts or found
+        estimates = summarise(episodes, found["cost_limits"], None, options.cvar_alpha)
+        rows.append(VariedRow(variation, estimates))
     _write(file, rows)
     return Varied(tuple(rows), tuple(left_out), facts, file)
 
