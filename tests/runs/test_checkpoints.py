@@ -83,6 +83,10 @@ def test_a_best_one_that_was_displaced_is_the_best_again_after_resuming_from_bef
     assert again.save_best(4, 7.0)
     again.save(4)
     assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [4]
+    # what a killed run has left behind is removed, too
+    assert CheckpointStore(tmp_path, parts(1), keep_last=1, keep_best=2).save_best(5, 1.0)
+    again.save(6)
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [4]
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "text", "missing"])
