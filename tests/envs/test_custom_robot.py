@@ -3,6 +3,7 @@
 import copy
 import math
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -237,3 +238,38 @@ def test_registered_robots_are_made_by_name(make, tmp_path):
         assert env.observation_layout == {"gyro": slice(0, 3)}
     with pytest.raises(ConfigError, match=r"built-in robot"):
         register_robot("car", tmp_path / "robot.xml")
+
+
+@pytest.mark.parametrize("masks", [(1, 0), (2, 2), (4, 1)])
+def test_robots_with_other_masks_stand_on_the_floor_and_touch_objects(make, masks):
+    """Gymnasium's Ant has the masks (1, 0)."""
+    default = '<default><geom contype="{}" conaffinity="{}"/></default>'.format(*masks)
+    xml = changed(BALL, "<worldbody>", default + "<worldbody>")
+    keys = {"robot_locations": [[0, 0]], "robot_keepout": 0.0, "pillars_keepout": 0.0}
+    env = make(xml, task="none", vases_num=1, pillars_num=1, pillars_locations=[[0.2, 0]],
+               constrain_pillars=True, **keys)  # fmt: skip
+    rollout = env.rollout(50)
+    heights = env.get_positions().apply(lambda place: place[..., 2])
+    assert heights["robot"].min() > 0.1
+    assert heights["vases"].min() > 0.09
+    assert rollout["next", "cost_pillars"][:, 0].all()
+
+
+@pytest.mark.parametrize(
+    "options", ['settotalmass="5"', 'boundmass="1" boundinertia="0.1"', 'inertiagrouprange="0 0"']
+)
+def test_options_about_masses_are_those_of_the_robot_alone(make, options):
+    xml = changed(DISC, "<mujoco>", f"<mujoco><compiler {options}/>")
+    alone = mujoco.MjSpec.from_string(xml).compile()
+    model = make(xml, task="push", **EVERYTHING)._world.scene.model
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_iquat"):
+        given, wanted = getattr(model, name), getattr(alone, name)[1:]
+        np.testing.assert_array_equal(given[1 : 1 + len(wanted)], wanted, name)
+    assert model.body("vase0").mass == pytest.approx(0.001 * 0.2**3)
+
+
+def test_a_default_mass_of_the_robots_geoms_is_not_that_of_objects(make):
+    xml = changed(DISC, 'density="10"', 'mass="1"')
+    model = make(xml, vases_num=1, vases_density=2.0)._world.scene.model
+    assert model.body("robot").mass == 1.0
+    assert model.body("vase0").mass == pytest.approx(2.0 * 0.2**3)

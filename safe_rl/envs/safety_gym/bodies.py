@@ -18,6 +18,13 @@ def add_floor(spec: mujoco.MjSpec) -> None:
     """Add the ground plane."""
     floor = spec.worldbody.add_geom(spec.default, type=mujoco.mjtGeom.mjGEOM_PLANE, name="floor")
     floor.size = [FLOOR_HALF_SIZE, FLOOR_HALF_SIZE, 0.1]
+    _collide(floor)
+
+
+def _collide(geom: mujoco.MjsGeom) -> None:
+    """Let a shape collide with objects, and with robots whose file has other defaults."""
+    geom.contype |= 1
+    geom.conaffinity |= 1
 
 
 def add_bodies(
@@ -82,9 +89,13 @@ def _add_geoms(
         geom = body.add_geom(spec.default, type=shape.type, pos=shape.pos, group=element.group)
         geom.size[: len(shape.size)] = shape.size
         geom.rgba = [*element.rgb, 0.25 if ghost else 1.0]
-        geom.contype = geom.conaffinity = 0 if ghost else 1
+        if ghost:
+            geom.contype = geom.conaffinity = 0
+        else:
+            _collide(geom)
         if element.is_free:
             geom.density = getattr(config, f"{element.kind}_density")
+            geom.mass = math.nan  # a default of the robot file would replace the density
 
 
 # Rotation about x by 45 degrees: the camera looks north and down.

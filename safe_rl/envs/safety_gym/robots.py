@@ -2,7 +2,8 @@
 
 A robot file has a body named "robot" at the top level of its world. The body stands upright and is
 placed by its root joint: a free joint, or slides along x and y and a hinge about z. The geom
-defaults of the file apply to the whole world. An actuator without a `ctrlrange` gets [-1, 1].
+defaults of the file apply to the whole world, but masses and the masks of collisions only to the
+robot. An actuator without a `ctrlrange` gets [-1, 1].
 """
 
 from __future__ import annotations
@@ -88,15 +89,37 @@ def load_robot(base: str) -> Robot:
         spec = mujoco.MjSpec.from_file(str(path))
         for key in list(spec.keys):
             spec.delete(key)  # a pose of the robot alone does not fit the world
-        model = spec.copy().compile()
+        compiled = spec.copy()
+        model = compiled.compile()
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
     _check_ranges(model, path)
     _check_body(model, path)
+    if _changes_all_masses(spec.compiler):
+        spec = _with_masses_of(compiled, model)
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
             actuator.ctrlrange, actuator.ctrllimited = CONTROL_RANGE, True
     return Robot(spec, model.nbody - 1, model.nsensor, _is_planar(model, path))
+
+
+def _changes_all_masses(options: mujoco.MjsCompiler) -> bool:
+    """Whether options of a robot's file would change the masses of the objects around it, too."""
+    bounded = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
+    return bounded or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1]
+
+
+def _with_masses_of(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec:
+    """Give the bodies of a compiled robot the masses of its model, and unset these options."""
+    for body in spec.bodies[1:]:
+        body.explicitinertial, body.mass = True, model.body_mass[body.id]
+        body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+        body.inertia, body.fullinertia = model.body_inertia[body.id], [math.nan] * 6
+    options = spec.compiler
+    options.settotalmass, options.boundmass, options.boundinertia = -1.0, 0.0, 0.0
+    options.inertiagrouprange = [0, mujoco.mjNGROUP - 1]
+    options.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    return spec
 
 
 def _check_ranges(model: mujoco.MjModel, path: Path) -> None:
