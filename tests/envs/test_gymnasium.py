@@ -9,6 +9,7 @@ import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
+from torchrl.envs import GymEnv
 
 from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymEnv, env_node, make_env
 from safe_rl.envs.velocity import VELOCITY_SUITE
@@ -171,6 +172,21 @@ def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
             assert not got[-1][f"_{key.removeprefix('_')}"].any()
     ends = np.array([step[2] | step[3] for step in outcomes if len(step) == 5])
     assert len({tuple(row) for row in ends.T.tolist()}) > 1
+
+
+def test_torchrl_makes_them_by_their_ids_and_reads_their_infos():
+    env = GymEnv("Safexp-PointGoal1-v0", config={"goal_size": 5.0}).auto_register_info_dict()
+    env.set_seed(3)
+    step = env.rollout(5)["next"]
+    assert {"cost", "cost_hazards", "cost_exception"} < set(step.keys())
+    assert step["cost"].dtype == torch.float64
+    assert step["goal_met"].dtype == torch.bool
+    assert step["goal_met"].any()
+
+
+def test_an_argument_that_is_a_key_of_the_configuration_is_told_where_it_belongs():
+    with pytest.raises(TypeError, match=r"unexpected keyword argument 'hazards_num': put keys"):
+        gymnasium.make("Safexp-PointGoal1-v0", hazards_num=3)
 
 
 def test_a_batch_that_is_not_reset_says_so():

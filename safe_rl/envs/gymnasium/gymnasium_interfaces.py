@@ -71,7 +71,11 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         """Take one action [nu]."""
         observation, values, infos = self._step(np.asarray(action)[None])
         reward, terminated, truncated = (value[0].item() for value in values)
-        info = {key: value[0].item() for key, value in infos.items()} | self._position()
+        # TorchRL reads only what has a dtype from an info, and Gymnasium batches only numbers and
+        # arrays of NumPy; its booleans are not among these, so an event is an array without axes.
+        info = {
+            key: value[0] if value.dtype != bool else value[0, ...] for key, value in infos.items()
+        } | self._position()
         return take(observation, 0), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:

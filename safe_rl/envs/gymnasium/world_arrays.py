@@ -58,7 +58,11 @@ class Worlds:
     ) -> None:
         if unknown:
             name = next(iter(unknown))
-            raise TypeError(f"There is no argument '{name}': put keys into config={{'{name}': …}}.")
+            # TorchRL's `GymEnv` tries an argument `frameskip`, and looks for these words
+            raise TypeError(
+                f"{type(self).__name__} got an unexpected keyword argument '{name}': put keys of "
+                f"the configuration into config={{'{name}': …}}."
+            )
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
