@@ -35,6 +35,7 @@ class ConstrainedEnv(EnvBase):
             observation is nested, the columns that it would have if it were flat. It has no
             default.
         return_key: Key below "next" of the rewards that returns are computed from.
+        events: Names of entries [N, 1] (bool) that say what happened in a step.
         seconds_per_step: Simulated time of a step [s]; None if unknown.
         steps_per_decision: Environment steps that one call of `step` takes. If it is not 1, each
             call writes their number to `steps_taken` [N, 1]: it is lower where an episode ends.
@@ -54,6 +55,7 @@ class ConstrainedEnv(EnvBase):
     max_episode_steps: Any
     observation_layout: Any
     return_key: str = "reward"
+    events: tuple[str, ...] = ()
     seconds_per_step: Any = None
     steps_per_decision: Any = 1
     steps_before: int = 0

@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 from point_mass import PointMass
+from torchrl.envs import Compose, TransformedEnv
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
 from safe_rl.envs import make_env
@@ -82,6 +83,7 @@ def test_sums_are_those_of_single_steps_over_several_episodes(k):
     # of episodes of 10 steps, repeats of 3 and 4 reach beyond the end
     config = {"robot_base": "point", "task": "goal", "num_steps": 10, "hazards_num": 8}
     config |= {"constrain_hazards": True, "hazards_keepout": 0.0, "hazards_size": 0.6}
+    config |= {"goal_size": 1.0}
     single, env = make_env(config, num_envs=3, seed=1), make_env(config, num_envs=3, seed=1)
     env = transformed(env, repeat=ActionRepeat(k))
     torch.manual_seed(0)
@@ -92,16 +94,18 @@ def test_sums_are_those_of_single_steps_over_several_episodes(k):
     state = single.reset()
     for number in range(2 * decisions):
         after = held["next"][:, number]
-        sums = dict.fromkeys(("reward", *env.cost_keys), torch.zeros(3, 1))
+        sums = dict.fromkeys(("reward", *env.cost_keys, "goal_met"), torch.zeros(3, 1))
         for _ in range(int(taken[0, number])):
             state["action"] = held["action"][:, number]
             step, state = single.step_and_maybe_reset(state)
             sums = {key: total + step["next", key] for key, total in sums.items()}
+        sums["goal_met"] = sums["goal_met"] > 0
         for key, total in sums.items():
             assert torch.equal(after[key], total), key
         for key in ("observation", "done", "truncated"):
             assert torch.equal(after[key], step["next", key]), key
     assert held["next", "cost"].sum() > 0
+    assert held["next", "goal_met"].any()
 
 
 def test_a_row_that_ends_inside_a_repeat_stops_alone():
@@ -123,6 +127,13 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     held, steps = still(env, 1)["next"], still(single, 4)["next"]
     assert held["steps_taken"].flatten().tolist() == [2, 4, 3]
     assert torch.equal(held["observation"][1, -1], steps["observation"][1, -1])
+
+
+@pytest.mark.parametrize("other", [ActionDelay(2), EarlyTermination({"cost": 2.0})])
+def test_others_beside_a_repeat_would_act_once_per_decision_and_are_refused(other):
+    env = TransformedEnv(PointMass(2), Compose(other, ActionRepeat(4)))
+    with pytest.raises(ValueError, match=rf"{type(other).__name__} must act .*make_env\("):
+        env.reset()
 
 
 def test_evaluation_counts_steps_of_the_environment():

@@ -67,7 +67,6 @@ class Worlds:
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
-        self._events = [name for name in self.batch.flags if name not in SimulatedEnv.flags]
         rate = max(1, round(1 / self.batch.seconds_per_step))  # of real time
         self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
 
@@ -122,12 +121,10 @@ class Worlds:
         """Take a step; return observation, (reward, terminated, truncated) [N] each, and infos."""
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.batch.device)
         step = self.batch.step(TensorDict({"action": action}, self.batch.batch_size))["next"]
-        column = {
-            name: step[name].squeeze(-1).cpu().numpy()
-            for name in ("reward", "terminated", "truncated", *self.batch.cost_keys, *self._events)
-        }
+        names = ("reward", "terminated", "truncated", *self.batch.cost_keys, *self.batch.events)
+        column = {name: step[name].squeeze(-1).cpu().numpy() for name in names}
         infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
-        infos |= {key: column[key] for key in self._events}
+        infos |= {key: column[key] for key in self.batch.events}
         values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
         return arrays_of(step["observation"]), values, infos
 

@@ -87,7 +87,8 @@ class SafetyGymEnv(SimulatedEnv):
         torch.Size([4, 10, 1])
     """
 
-    flags: ClassVar = ("goal_met", *SimulatedEnv.flags)
+    events = ("goal_met",)
+    flags: ClassVar = (*events, *SimulatedEnv.flags)
     first_camera: ClassVar = "fixedfar"
     copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
 

@@ -153,13 +153,17 @@ class ActionDelay(ConstraintTransform):
 class ActionRepeat(ConstraintTransform):
     """The policy acts at every k-th step, and its action is held for the steps between.
 
-    Rewards and costs of the k steps are summed, so that returns and limits keep their meaning. A
-    row whose episode ends between two decisions takes no further steps; `steps_taken` is the number
-    of steps of a decision. The transform is also used in evaluation. It must be the last transform;
-    the others act at every step.
+    Rewards and costs of the k steps are summed, so that returns and limits keep their meaning, and
+    `goal_met` is True if a goal was met in any of them. A row whose episode ends between two
+    decisions takes no further steps; `steps_taken` is the number of steps of a decision. The
+    transform is also used in evaluation. It must be the last transform; the others act at every
+    step.
 
     Args:
         k: Steps for which an action is held.
+
+    Raises:
+        ValueError: At a reset, if it shares TorchRL's `Compose` with others of these transforms.
 
     Examples:
         >>> from safe_rl.envs import make_env
@@ -174,11 +178,20 @@ class ActionRepeat(ConstraintTransform):
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return that no step was taken."""
+        beside = getattr(self.container.transform, "transforms", ())
+        others = [t for t in beside if isinstance(t, ConstraintTransform) and t is not self]
+        if others:
+            raise ValueError(
+                f"{type(others[0]).__name__} must act at every step, but together with "
+                "ActionRepeat it would act at every decision: make the environment by "
+                "make_env(…, transforms={…}) or transform_env instead of TransformedEnv."
+            )
         return {STEPS_TAKEN: torch.zeros_like(done, dtype=torch.int64)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         env, result = self.container.base_env, next_tensordict
         rewards_and_costs = list(env.full_reward_spec.keys(True, True))
+        events = getattr(env, "events", ())
         taken = torch.ones_like(result.get("done"), dtype=torch.int64)
         for _ in range(self.steps_per_decision - 1):
             active = ~result.get("done")
@@ -189,6 +202,7 @@ class ActionRepeat(ConstraintTransform):
             state = env.maybe_reset(tensordict.clone(False).update(result))
             after = env._step(state.set("action", tensordict.get("action")))
             after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
+            after.update({key: result.get(key) | after.get(key) for key in events})
             taken += active
             result = after if active.all() else _where(active, after, result)
         self._rows = {STEPS_TAKEN: taken}

@@ -35,6 +35,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         super().__init__(base_env, Compose(*transforms.values()))
         self.max_episode_steps = base_env.max_episode_steps
         self.seconds_per_step = base_env.seconds_per_step
+        self.events = base_env.events
         self._names = list(transforms)
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
