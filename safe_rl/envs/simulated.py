@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.errors import require_integer
+from safe_rl.envs.errors import require_all_rows, require_integer
 from safe_rl.envs.physics import Physics
 
 
@@ -159,6 +159,7 @@ class SimulatedEnv(ConstrainedEnv):
         return next_tensordict_out
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
+        require_all_rows(tensordict.get("_step", None))
         action, needed = tensordict["action"], self._physics.ctrl.shape
         if action.shape != needed or not action.dtype.is_floating_point:
             raise ValueError(

@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch
+from torchrl.envs import ConditionalSkip, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env, resolve
@@ -163,6 +164,16 @@ def test_partial_resets_leave_other_rows_alone(name):
         same = torch.equal(steps[0]["next", "observation"], steps[1]["next", "observation"])
         assert same == (step < 8)
         states = [env.step_mdp(taken) for env, taken in zip(envs, steps, strict=True)]
+
+
+@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
+def test_steps_of_some_rows_only_are_refused(name):
+    skip = ConditionalSkip(lambda step: torch.tensor([True, False]))
+    env = TransformedEnv(make_env(name, num_envs=2, seed=0), skip)
+    with pytest.raises(NotImplementedError, match=r"step of some worlds only.*num_envs=1"):
+        env.rollout(2)
+    alone = ConditionalSkip(lambda step: torch.tensor([True]))
+    assert TransformedEnv(make_env(name, num_envs=1, seed=0), alone).rollout(2).shape == (1, 2)
 
 
 def test_a_reset_leaves_nothing_of_the_episode_before():
