@@ -212,6 +212,14 @@ def test_transforms_of_torchrl_can_stand_among_ours():
     check_env_specs(env)
     # what they remember is in no snapshot
     assert env.get_state() is None
+    for add in (TransformedEnv.append_transform, lambda env, t: env.insert_transform(0, t)):
+        env = transformed(PointMass(2), "saute", "noise")
+        assert env.get_state() is not None
+        assert add(env, StepCounter()) is env
+        env.set_seed(0)
+        assert env.rollout(3)["next", "step_count"][0, :, 0].tolist() == [1, 2, 3]
+        assert env.highest_cost("cost") == transformed(PointMass(2), "saute").highest_cost("cost")
+        assert env.get_state() is None
 
 
 def test_nodes_are_built_and_their_keys_named():

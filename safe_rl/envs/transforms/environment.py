@@ -36,10 +36,9 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self.max_episode_steps = base_env.max_episode_steps
         self.seconds_per_step = base_env.seconds_per_step
         self.events = base_env.events
-        self._names = list(transforms)
+        self._named = dict(transforms)
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
-        self._stores = all(isinstance(t, ConstraintTransform) for t in transforms.values())
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours().items():
             try:
@@ -54,8 +53,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self._seed_transforms(seed)
 
     def _ours(self) -> dict[str, ConstraintTransform]:
-        named = zip(self._names, self.transform.transforms, strict=True)
-        return {name: t for name, t in named if isinstance(t, ConstraintTransform)}
+        return {n: t for n, t in self._named.items() if isinstance(t, ConstraintTransform)}
 
     @property
     def render(self) -> Any:
@@ -109,9 +107,12 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def get_state(self) -> TensorDictBase | None:
         """Return a copy of the complete state, a TensorDict [N].
 
-        None if the inner environment or one of the transforms cannot be stored.
+        None if the inner environment or one of the transforms cannot be stored; also if
+        `append_transform` or `insert_transform` has added one.
         """
-        state = self.base_env.get_state() if self._stores else None
+        ours = self._ours().values()
+        stores = all(any(t is one for one in ours) for t in self.transform.transforms)
+        state = self.base_env.get_state() if stores else None
         if state is None:
             return None
         for name, transform in self._ours().items():
