@@ -11,7 +11,15 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
 from torchrl.envs import GymEnv
 
-from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymEnv, env_node, make_env
+from safe_rl.envs import (
+    EXTRAS,
+    SUITE,
+    ConfigError,
+    SafetyGymConfig,
+    SafetyGymEnv,
+    env_node,
+    make_env,
+)
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
 IDS = [f"Safexp-{name}-v0" for name in (*SUITE, *EXTRAS)]
@@ -80,11 +88,14 @@ def test_any_configuration_can_be_made():
     assert "cost_hazards" in env.step(env.action_space.sample())[-1]
     changed = gymnasium.make("Safexp-PointGoal1-v0", config={"lidar_num_bins": 8})
     assert changed.observation_space.shape == (12 + 3 * 8,)
+    hopper = VELOCITY_SUITE["SafeHopperVelocity"].replace(num_steps=7)
+    assert gymnasium.make("SafeHopperVelocity-v0", config=hopper).spec.max_episode_steps == 7
     for told, name, given in (
         ("Did you mean 'hazards_num'", "Safexp-Custom", {"config": {"hazard_num": 2}}),
         (r"is a name: .*make_env\('PointRun'\)", "Safexp-Custom", {"config": "PointRun"}),
         ("mean 'velocity_threshold'", "SafeHopperVelocity", {"config": {"velocity_treshold": 1}}),
         (r"config=\{'hazards_num': …\}", "Safexp-PointGoal1", {"hazards_num": 3}),
+        ("or a VelocityConfig; got a Safety", "SafeAntVelocity", {"config": SafetyGymConfig()}),
         ("render_mode must be one of", "SafeHopperVelocity", {"render_mode": "ansi"}),
     ):
         with pytest.raises((ConfigError, TypeError, ValueError), match=told):
@@ -182,11 +193,6 @@ def test_torchrl_makes_them_by_their_ids_and_reads_their_infos():
     assert step["cost"].dtype == torch.float64
     assert step["goal_met"].dtype == torch.bool
     assert step["goal_met"].any()
-
-
-def test_an_argument_that_is_a_key_of_the_configuration_is_told_where_it_belongs():
-    with pytest.raises(TypeError, match=r"unexpected keyword argument 'hazards_num': put keys"):
-        gymnasium.make("Safexp-PointGoal1-v0", hazards_num=3)
 
 
 def test_a_batch_that_is_not_reset_says_so():

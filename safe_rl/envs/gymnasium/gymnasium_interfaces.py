@@ -28,8 +28,9 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
 
     Args:
         name: Name of the environment; None uses Safety Gym with the default of every key.
-        config: Keys to change, or a whole `SafetyGymConfig`. `num_steps` is the length of episodes;
-            `max_episode_steps` of `gymnasium.make` can only shorten them.
+        config: Keys to change, or a whole `SafetyGymConfig` or `VelocityConfig` of its family.
+            `num_steps` is the length of episodes; `max_episode_steps` of `gymnasium.make` can only
+            shorten them.
         render_mode: "rgb_array" for frames, or None; "human" is for `gymnasium.make`, whose wrapper
             shows the frames in a window.
         camera: Camera of the frames, as in the environment's `render`; None is its first.

@@ -20,14 +20,14 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.simulated import SimulatedEnv
-from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
+from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, VelocityConfig
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
 NUM_SEEDS = 2**62
 RENDER_MODES = ["rgb_array"]
 
 Observation = np.ndarray | dict[str, np.ndarray]
-Config = Mapping[str, Any] | SafetyGymConfig | None
+Config = Mapping[str, Any] | SafetyGymConfig | VelocityConfig | None
 
 
 class Worlds:
@@ -145,7 +145,15 @@ def batch_of(
     if isinstance(config, str):
         raise ConfigError(f"config='{config}' is a name: give keys, as make_env('{config}').config")
     base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())
-    whole = config if isinstance(config, SafetyGymConfig) else base.replace(**(config or {}))
+    if config is None or isinstance(config, Mapping):
+        whole = base.replace(**(config or {}))
+    elif isinstance(config, type(base)):
+        whole = config
+    else:
+        raise ConfigError(
+            f"'config' of {name} must be a mapping of keys to change, or a {type(base).__name__}; "
+            f"got a {type(config).__name__}."
+        )
     if num_steps is not None:
         whole = whole.replace(num_steps=num_steps)
     if isinstance(whole, SafetyGymConfig):
