@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete, Tuple
 from gymnasium_envs import Walk, make_pendulum
 from torchrl.envs.utils import check_env_specs
 
@@ -37,8 +38,8 @@ class Counter(gymnasium.Env):
         return self.observe(), 1.0, self.count >= self.length, False, info
 
 
-class Boundless(Counter):
-    action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+def acting(space):
+    return type("Acting", (Counter,), {"action_space": space})
 
 
 def test_costs_stand_beside_the_reward_and_are_those_of_the_environment():
@@ -158,7 +159,10 @@ def test_a_copy_continues_as_the_original_does(copied):
     ("given", "arguments", "told"),
     [
         ("Pendulum-v1", {}, r"reports no costs.*name it in 'cost_keys'"),
-        (Boundless, {}, r"or choices \(Discrete, MultiDiscrete\), got Unbounded"),
+        (acting(Box(-np.inf, np.inf, (1,))), {}, r"or choices \(Discrete.*, got Unbounded"),
+        (acting(Box(0.0, np.inf, (2,))), {}, r"finite bounds.* \[0.0, 0.0\] and \[inf, inf\]"),
+        (acting(Box(np.zeros(2), np.eye(2)[0])), {}, r"needs finite bounds.*and \[1.0, 0.0\]"),
+        (acting(Tuple([Discrete(2)])), {}, r"or choices .*got Tuple\(Discrete\(2\)\)"),
         (Counter, {"num_steps": None}, "give 'num_steps'"),
         (Counter(), {}, "an id, or a function that makes an environment; got <.*Counter"),
         (lambda: 3, {}, "must return a gymnasium.Env.*returned 3"),

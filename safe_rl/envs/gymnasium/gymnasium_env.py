@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete, MultiDiscrete
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
@@ -37,6 +37,11 @@ def make_adapted(
     """
     env: gymnasium.Env = FloatCosts(make(), cost_keys)
     seen, actions = env.observation_space, env.action_space
+    if not isinstance(actions, Box | Discrete | MultiDiscrete | MultiBinary):
+        raise ConfigError(
+            "The algorithms need actions that are continuous and bounded (a Box) or choices "
+            f"(Discrete, MultiDiscrete), got {actions}."
+        )
     # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled.
     if flatten:
         space = Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(seen),), np.float32)

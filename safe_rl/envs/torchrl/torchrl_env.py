@@ -13,6 +13,7 @@ import gymnasium
 import torch
 import torchrl.envs
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, OneHot
 from torchrl.envs import (
     ActionScaling,
@@ -113,6 +114,13 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
     """Transforms that clip continuous actions to [-1, 1] and scale them to the bounds."""
     spec = env.action_spec
     if isinstance(spec, Bounded) and spec.dtype.is_floating_point:
+        width = spec.space.high - spec.space.low
+        if not (width.isfinite() & (width > 0)).all():
+            raise ConfigError(
+                "Every action needs finite bounds, the lower one first, because policies act in "
+                f"[-1, 1], which is scaled to them. They are {_row(spec.space.low)} and "
+                f"{_row(spec.space.high)}."
+            )
         yield ActionScaling()
         yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)
         return
@@ -125,6 +133,10 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
             "The algorithms need actions that are continuous and bounded (a Box) or choices "
             f"(Discrete, MultiDiscrete), got {type(spec).__name__} {spec.dtype}."
         )
+
+
+def _row(bounds: Tensor) -> list[float]:
+    return bounds[0].flatten().tolist()
 
 
 def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -> EnvBase:
