@@ -142,8 +142,8 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         _refuse_unknown_kinds(kinds)
     for kind in (kind for kind in task.elements if not BY_KIND[kind].singular):
         raise ConfigError(f"Task '{name}' cannot add '{kind}': set the key '{kind}_num' instead.")
-    if task.met is not None and "goal" not in task.elements:
-        raise ConfigError(f"Task '{name}' meets goals: add 'goal' to its elements.")
+    if (task.met or task.next_goal) and "goal" not in task.elements:
+        raise ConfigError(f"Task '{name}' meets or draws goals: add 'goal' to its elements.")
     _add_keys(keys)
     TASKS[name] = task
     forget_scenes()

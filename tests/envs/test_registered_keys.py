@@ -21,6 +21,7 @@ from safe_rl.envs import (
 from safe_rl.envs.extending import (
     Cost,
     Key,
+    NextGoal,
     Reading,
     Task,
     register_cost,
@@ -89,6 +90,7 @@ WRONG = {
     "motion": (lambda: register_element(cube("a", "b", "free")), r"'motion' must .*\.FREE or"),
     "one object": (lambda: register_element(disc("oil", "oil"), {"oil_num": 2}), "only one object"),
     "next goal": (lambda: register_task("a", Task(max, next_goal="button")), "NextGoal.* got 'but"),
+    "no place": (lambda: register_task("a", Task(max, next_goal=NextGoal.BUTTON)), "add 'goal' to"),
     "a built-in key": (lambda: register_element(MINE, {"num_steps": 3}), "'num_steps'.*taken"),
     "a wrong default": (lambda: register_element(MINE, {"mines_num": "a"}), "'mines_num'.*whole"),
 }
