@@ -9,17 +9,25 @@ import torch
 
 from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import env_names, env_node, known_names, stored_node
+from safe_rl.envs.families import (
+    VELOCITY_TARGET,
+    config_node,
+    env_names,
+    env_node,
+    known_names,
+    stored_node,
+)
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
+from safe_rl.envs.velocity.velocity_config import VelocityConfig
 from safe_rl.naming import did_you_mean
 from safe_rl.targets import locate
 
 
 def make_env(
-    env: str | Mapping[str, Any] | SafetyGymConfig,
+    env: str | Mapping[str, Any] | SafetyGymConfig | VelocityConfig,
     *,
     num_envs: int = 1,
     device: torch.device | str = "cpu",
@@ -31,8 +39,8 @@ def make_env(
     """Make a batch of environments of any family.
 
     Args:
-        env: A name, also one from `store_config`; a configuration of Safety Gym; or a node of the
-            group `env`: `name`, `_target_` and the family's keys.
+        env: A name, also one from `store_config`; a configuration of Safety Gym or of the velocity
+            family; or a node of the group `env`: `name`, `_target_` and the family's keys.
         num_envs: Number of environments, N.
         device: Device of the TensorDicts.
         seed: Determines every random draw; None takes a seed from torch's generator.
@@ -49,6 +57,8 @@ def make_env(
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
+    if isinstance(env, VelocityConfig):
+        env = config_node("custom", env, VELOCITY_TARGET)
     env = _named(env) if isinstance(env, str) else env
     target = env.get("_target_") if isinstance(env, Mapping) else None
     build = SafetyGymEnv if target is None else locate(target, key="env._target_")

@@ -15,10 +15,10 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import OmegaConf
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import GROUP, config_node, env_names, env_node
+from safe_rl.envs.families import GROUP, VELOCITY_TARGET, config_node, env_names, env_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
-from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE
+from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, VelocityConfig
 from safe_rl.targets import allow
 
 SCHEME = "safe-rl-environments"
@@ -74,14 +74,14 @@ class EnvironmentsSearchPath(SearchPathPlugin):
         search_path.append(provider="safe_rl", path=f"{SCHEME}://")
 
 
-def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None:
+def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig | VelocityConfig) -> None:
     """Give a configuration a name, with which `env=<name>` and `make_env(name)` find it.
 
     Args:
         name: Name of the environment.
-        config: A configuration of Safety Gym (a mapping may have only the keys that differ from the
-            defaults), or a node with the `_target_` of another family. The module of that target
-            may then be imported, as with `import=`.
+        config: A configuration (a mapping of Safety Gym's keys may have only those that differ from
+            the defaults), or a node with the `_target_` of another family. The module of that
+            target may then be imported, as with `import=`.
 
     Raises:
         ConfigError: For the name of a built-in environment, an unknown key, or a value that cannot
@@ -100,6 +100,8 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig) -> None
         module = str(config["_target_"]).rpartition(".")[0]
         if module.partition(".")[0] not in ("safe_rl", "torch"):
             allow(module)
+    elif isinstance(config, VelocityConfig):
+        node = config_node(name, config, VELOCITY_TARGET)
     else:
         node = config_node(name, resolve(config))
     ConfigStore.instance().store(group=GROUP, name=name, node=node)

@@ -57,6 +57,16 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
         make_env(node, num_envs=4)
 
 
+@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
+def test_a_changed_configuration_is_made_and_stored(name):
+    changed = make_env(name, seed=0).config.replace(num_steps=7)
+    assert make_env(changed, num_envs=2, seed=0).config == changed
+    store_config("Brief", changed)
+    assert make_env("Brief", seed=0).config == changed
+    with pytest.raises(ConfigError, match=r"a SafetyGymConfig; got a NoneType"):
+        make_env(None)
+
+
 def test_names_of_families_and_of_2019_are_known():
     assert make_env("SafeSwimmerVelocity").config.robot == "swimmer"
     assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"

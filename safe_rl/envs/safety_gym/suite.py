@@ -146,6 +146,11 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         return check(env)
     if isinstance(env, Mapping):
         return check(SafetyGymConfig.from_dict(env))
+    if not isinstance(env, str):
+        raise ConfigError(
+            "An environment of Safety Gym is given by its name, a mapping of keys, or a "
+            f"SafetyGymConfig; got a {type(env).__name__}."
+        )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
     named = SUITE | EXTRAS
     if name not in named:
