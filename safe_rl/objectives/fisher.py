@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Distribution, Normal
 from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import ReferencePolicy, root, sampler_of
+from safe_rl.objectives.samples import inputs_of
 from safe_rl.objectives.trust_region import flatten, policy_in, unflatten
 
 #: Outputs of a policy's network, and multiplication by the Fisher matrix with respect to them.
@@ -59,7 +60,7 @@ def _geometry_by_differentiation(
     Hessian with respect to θ. The graph of M does not contain the network itself.
     """
     sampler = sampler_of(actor)
-    parameters = actor.get_dist_params(batch.select(*actor.in_keys)).select(*sampler.in_keys)
+    parameters = actor.get_dist_params(inputs_of(actor, batch)).select(*sampler.in_keys)
     keys = [key for key, output in parameters.items(True, True) if output.requires_grad]
     outputs = [parameters.get(key) for key in keys]
     moved = parameters.detach()

@@ -11,6 +11,7 @@ from torch.distributions import Distribution
 from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import has_closed_kl
+from safe_rl.objectives.samples import inputs_of
 from safe_rl.objectives.surrogate import WeighsCosts
 from safe_rl.ranges import Positive, Range, Share, Weight
 
@@ -125,7 +126,7 @@ class CUPLoss(WeighsCosts):
     @torch.no_grad()
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the current policy's parameters into a batch, as π½, and return the batch."""
-        observed = tensordict.select(*self.actor_network.in_keys)
+        observed = inputs_of(self.actor_network, tensordict)
         actor, weights = self.actor_network, self.actor_network_params
         with weights.to_module(actor, preserve_module_state=False), set_recurrent_mode(True):
             parameters = actor.get_dist_params(observed)

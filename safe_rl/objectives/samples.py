@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, is_tensor_collection
+from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS, LossModule
@@ -32,6 +33,15 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
     near = nearest(key_name(unravel_key(key)), present)
     meant = "" if near is None else f" Did you mean {present[near]!r}?"
     raise KeyError(f"No entry {key!r} in the batch.{meant} Keys: {sorted(present)}. {hint}".strip())
+
+
+def inputs_of(network: TensorDictModuleBase, batch: TensorDictBase) -> TensorDictBase:
+    """The inputs of a network, as a copy in which the network may write.
+
+    If a policy writes the parameters of a composite distribution one by one, below ``"params"``,
+    this entry is among its inputs. Without a copy it would replace those of the behaviour policy.
+    """
+    return batch.select(*network.in_keys).copy()
 
 
 FIRST = "is_init"

@@ -20,7 +20,7 @@ from safe_rl.objectives.distributions import (
     sampler_of,
 )
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.samples import require, sample_mask
+from safe_rl.objectives.samples import inputs_of, require, sample_mask
 from safe_rl.ranges import Checked, NotNegative
 
 
@@ -186,7 +186,7 @@ class SurrogateLoss(Checked, LossModule):
 
     def _policy(self, tensordict: TensorDictBase) -> Distribution:
         # A copy: actors write their loc and scale, which in the batch are the behaviour policy's.
-        observed = tensordict.select(*self.actor_network.in_keys)
+        observed = inputs_of(self.actor_network, tensordict)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             return self.actor_network.get_dist(observed)
 

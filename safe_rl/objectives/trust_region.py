@@ -13,6 +13,7 @@ from torch.distributions import Distribution
 from torchrl.modules import set_recurrent_mode
 
 from safe_rl.objectives.distributions import ReferencePolicy
+from safe_rl.objectives.samples import inputs_of
 
 #: Squared sine of the angle below which two approximate solutions count as parallel.
 _SAME_DIRECTION = 1e-5
@@ -52,7 +53,7 @@ def policy_in(
 ) -> Distribution:
     """Distribution of the policy in the states of a batch; a recurrent policy reads sequences."""
     with set_recurrent_mode(True):
-        return actor_network.get_dist(batch.select(*actor_network.in_keys))
+        return actor_network.get_dist(inputs_of(actor_network, batch))
 
 
 @torch.no_grad()

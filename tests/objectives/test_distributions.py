@@ -100,6 +100,50 @@ def test_a_composites_log_probabilities_may_be_stored_together(aggregate):
     torch.testing.assert_close(losses["loss_objective"], -batch["advantage"].mean())
 
 
+class Apart(nn.Module):
+    """The parameters of a composite distribution, one by one."""
+
+    keys = (
+        *(("throttle", "loc"), ("throttle", "scale"), ("wheel", "loc"), ("wheel", "scale")),
+        ("gear", "logits"),
+    )
+
+    def __init__(self, together):
+        super().__init__()
+        self.together = together
+
+    def forward(self, observation):
+        parameters = self.together(observation)
+        return tuple(parameters[key] for key in self.keys)
+
+
+def test_parameters_of_a_composite_may_be_written_one_by_one():
+    """As in TorchRL's documentation; then their entry counts as an input of the policy."""
+    actor, batch = make_case("composite")
+    whole = actor.module[0].module
+    parameters = TensorDictModule(
+        Apart(whole), ["observation"], [("params", *key) for key in Apart.keys]
+    )
+    apart = ProbabilisticActor(
+        parameters, in_keys=["params"], out_keys=ACTIONS, return_log_prob=True,
+        distribution_class=KINDS["composite"][-1],
+    )  # fmt: skip
+    perturb(actor, 0.1)
+    written = batch.clone()
+    found, expected = (
+        FOCOPSLoss(
+            policy, LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05), entropy_coeff=0.01,
+            **PROJECTIONS[FOCOPSLoss],
+        )(batch)
+        for policy in (apart, actor)
+    )  # fmt: skip
+    assert expected["kl"] > 0
+    torch.testing.assert_close(found, expected)
+    reference = ReferencePolicy(behaviour(actor, batch))
+    torch.testing.assert_close(mean_kl(reference, apart, batch), expected["kl"])
+    torch.testing.assert_close(batch, written)
+
+
 def test_a_nan_within_a_part_is_found_before_anything_is_learnt():
     actor, batch = make_case("composite")
     batch["params", "wheel", "loc"][3, 0] = torch.nan
