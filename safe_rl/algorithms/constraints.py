@@ -246,6 +246,7 @@ class TrackedConstraints(Constraints):
             return
         self.multiplier.set_scale(state.scale)
         self.multiplier.set_unit(state.unit)
+        self.multiplier.set_target(state.target)
         self.multiplier.update(state.violation)
         advantage = batch.get(self.cost_advantage, None)
         if advantage is not None:

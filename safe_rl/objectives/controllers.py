@@ -104,6 +104,7 @@ class PIDMultiplier(Multiplier):
     """
 
     scale: Tensor
+    raised: Tensor
     integral: Tensor
     smoothed_error: Tensor
     smoothed_cost: Tensor
@@ -133,19 +134,27 @@ class PIDMultiplier(Multiplier):
         self.kp, self.ki, self.kd = kp, ki, kd
         self.proportional_ema, self.derivative_ema = proportional_ema, derivative_ema
         self.register_buffer("scale", scales.clone())
+        # target − limit, set before every update: checkpoints need not hold it
+        self.register_buffer("raised", torch.zeros(self.num_costs), persistent=False)
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
         for name in ("smoothed_error", "smoothed_cost"):
             self.register_buffer(name, torch.zeros(self.num_costs))
         self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
 
+    def set_target(self, target: Tensor) -> None:
+        """Set the target that violations are measured from, [k]; by default the limits.
+
+        Without it, the derivative term would take a falling target for a growing cost.
+        """
+        self.raised.copy_(target - self.limits)
+
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
         error = violation / self.scale
         smoothed_error = torch.lerp(error, self.smoothed_error, self.proportional_ema)
         integral = (self.integral + self.ki * error).clamp_min(0)
-        cost = torch.lerp(
-            (violation + self.limits) / self.scale, self.smoothed_cost, self.derivative_ema
-        )
+        cost = (violation + self.limits + self.raised) / self.scale
+        cost = torch.lerp(cost, self.smoothed_cost, self.derivative_ema)
         growth = (cost - self.past_costs[0]).clamp_min(0)
         penalty = self.kp * smoothed_error + integral + self.kd * growth
         return {

@@ -136,6 +136,9 @@ class Multiplier(Checked, nn.Module, ABC):
     def set_unit(self, unit: Tensor) -> None:
         """Set the typical size u of one cost, [k] > 0; some multipliers divide violations by it."""
 
+    def set_target(self, target: Tensor) -> None:
+        """Set the target that violations are measured from, [k]; most multipliers ignore this."""
+
     @abstractmethod
     def _step(self, violation: Tensor) -> dict[str, Tensor]:
         """Return the new value of every state buffer ([..., k]) given finite J_c − d, [k]."""

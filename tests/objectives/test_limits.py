@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.objectives import ProjectedMultiplier
+from safe_rl.objectives import PIDMultiplier, ProjectedMultiplier
 from safe_rl.objectives.limits import LimitTracker, PredictedChange
 
 SETTINGS = {
@@ -151,6 +151,25 @@ def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
         found.append(constraints.multiplier.value)
     assert found[0] > 1.0
     torch.testing.assert_close(*found)
+
+
+def test_a_falling_limit_is_no_growth_of_the_cost():
+    gains = {"init": 0.0, "kp": 0.0, "ki": 0.0, "kd": 1.0, "derivative_delay": 1, "scale": 1.0}
+    constraints = TrackedConstraints(
+        {"cost": 25.0},
+        tracker=tracker(free_steps=0, descent_steps=10_000),
+        multiplier=PIDMultiplier(25.0, **gains, proportional_ema=0.0, derivative_ema=0.0),
+    )
+    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
+    found, targets = [], []
+    for _ in range(5):
+        costs = torch.full((20, 100, 1), 0.06)
+        constraints.update(episodes, TensorDict({"next": {"cost": costs}}, [20, 100]))
+        found.append(constraints.multiplier.value.item())
+        targets.append(constraints.columns()["target_cost"])
+    assert targets[0] - targets[-1] > 10
+    # costs before the first update count as 0
+    assert found == pytest.approx([60.0, 0.0, 0.0, 0.0, 0.0], abs=1e-4)
 
 
 def test_predictions_per_step_are_held_against_the_costs_of_episodes():
