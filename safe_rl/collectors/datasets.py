@@ -33,6 +33,7 @@ _OF_AN_EPISODE = _NAMES | {
     ("next", "truncated"): "truncations",
 }
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
+_ROUNDING = 1e-7  # of a limit: the relative rounding error of costs in single precision is lower
 
 
 def read_dataset(path: Path | str) -> TensorDictBase:
@@ -74,7 +75,8 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
     for key, limit in limits.items():
         cost = steps["next", key].squeeze(-1).double()
         total = torch.zeros(done.shape[0], number, dtype=torch.float64)
-        is_kept = is_kept & (total.scatter_add_(1, episode, cost) <= limit)
+        total.scatter_add_(1, episode, cost)
+        is_kept = is_kept & (total <= limit * (1 + _ROUNDING))
     return steps.reshape(1, -1)[:, is_kept.gather(1, episode).reshape(-1)]
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
+from tensordict import TensorDict
 from torchrl.modules import RandomPolicy
 
 from safe_rl.collectors import (
@@ -102,6 +103,15 @@ def test_safe_episodes_are_those_that_the_accounting_finds(limits):
     assert ends.nonzero()[:, 1].tolist() == [19] * len(ends)
     returns = found["next", "reward"].reshape(-1, 20).double().sum(-1)
     torch.testing.assert_close(returns, episodes.returns[expected])
+
+
+def test_an_episode_at_exactly_the_limit_is_safe():
+    """Also with costs of 0.1, which single precision rounds up; 1.1 is above the limit."""
+    done = torch.zeros(2, 11, 1, dtype=torch.bool)
+    done[0, 9] = done[1, 10] = True
+    following = {"cost": torch.full((2, 11, 1), 0.1), "done": done}
+    found = safe_episodes(TensorDict(next=following, batch_size=[2, 11]), {"cost": 1.0})
+    assert found.shape == (1, 10)
 
 
 def write_hdf5(h5py, path, size=6, leave_out=()):
