@@ -149,8 +149,15 @@ class OffPolicy(Resumable, Algorithm, Recipe):
     @property
     def lost_on_resume(self) -> str:
         """A sentence on the state that a checkpoint does not have; empty if it has all of it."""
-        if self.replay_buffer.keeps or not self.collects:
+        if self.replay_buffer.keeps:
             return ""
+        if not self.collects:
+            if not self.replay_buffer.is_prioritised:
+                return ""
+            return (
+                "The priorities of the transitions are not stored (memory.keep=false): learning "
+                "differs from a run that was not interrupted."
+            )
         resumes = f"resumes when it holds {self.random_steps:,} new ones"
         if len(self.replay_buffer):
             resumes = "resumes with those of the dataset alone"

@@ -44,6 +44,10 @@ class Memory(Checked):
     Raises:
         ValueError: If ``prioritised`` has other keys than these two.
 
+    Attributes:
+        keeps: ``keep``.
+        is_prioritised: Whether transitions have priorities.
+
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
@@ -71,7 +75,7 @@ class Memory(Checked):
     ) -> None:
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
-        self._is_prioritised = prioritised is not None
+        self.is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(capacity, device=self._device),
             sampler=_sampler(capacity, prioritised),
@@ -124,7 +128,7 @@ class Memory(Checked):
 
         Uniform samples of several minibatches are gathered together, in a tenth of the time.
         """
-        at_once = 1 if self._is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
+        at_once = 1 if self.is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
         for first in range(0, number, at_once):
             count = min(at_once, number - first)
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
@@ -132,14 +136,14 @@ class Memory(Checked):
 
     def learned(self, minibatch: TensorDictBase, priority: NestedKey | None = "td_error") -> None:
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
-        if self._is_prioritised:
+        if self.is_prioritised:
             self._buffer.update_priority(minibatch["index"], minibatch[priority])
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions, the position of the next one, and the state of n-step sums."""
         size = len(self)
         state: dict[str, Any] = {"size": size, "writer": self._buffer.writer.state_dict()}
-        if self._is_prioritised:
+        if self.is_prioritised:
             state["sampler"] = self._buffer.sampler.state_dict()
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
@@ -160,7 +164,7 @@ class Memory(Checked):
             steps = TensorDict(state_dict["steps"], batch_size=[size]).unflatten_keys("/")
             self._buffer.extend(steps)
         self._buffer.writer.load_state_dict(state_dict["writer"])
-        if self._is_prioritised:
+        if self.is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
         if self._multi_step is not None:
             self._multi_step._buffer = None

@@ -187,9 +187,13 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     keys += ["dataset.alone=true", "exploration.random_steps=10000"]
     alone = make_trainer(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "alone")
     assert not alone.algorithm.policy.is_random
+    assert alone.algorithm.lost_on_resume == ""
     assert alone.epoch(alone.batches())["policy_num_updates"] == 8
     assert not alone.algorithm.policy.is_random
     assert len(alone.algorithm.replay_buffer) == before
+    keys += ["memory.prioritised={alpha: 0.6, beta: 0.4}"]
+    drawn = make_trainer(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "drawn")
+    assert "priorities" in drawn.algorithm.lost_on_resume
 
 
 def test_the_loss_is_the_mean_squared_difference():
