@@ -151,7 +151,8 @@ class SurrogateLoss(Checked, LossModule):
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If advantages do not match log-probabilities or multipliers in shape.
+            ValueError: If advantages do not match log-probabilities or multipliers in shape, or
+                the batch was not collected under ``torch.no_grad()``.
         """
         distribution = self._policy(tensordict)
         log_weight = self._log_weight(tensordict, distribution)
@@ -196,15 +197,20 @@ class SurrogateLoss(Checked, LossModule):
         if self._composite_keys is not None:
             stored = self._composite_keys[1]
             now, behaviour = composite_log_probs(distribution, tensordict, stored)
-            return (now - behaviour).unsqueeze(-1)
-        log_prob = distribution.log_prob(require(tensordict, keys.action))
-        behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
-        if behaviour.shape != log_prob.shape:
+        else:
+            now = distribution.log_prob(require(tensordict, keys.action))
+            behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
+        if behaviour.shape != now.shape:
             raise ValueError(
                 f"{keys.sample_log_prob!r} has shape {tuple(behaviour.shape)}, expected "
-                f"{tuple(log_prob.shape)}: one log-probability per action, no trailing dimension."
+                f"{tuple(now.shape)}: one log-probability per action, no trailing dimension."
             )
-        return (log_prob - behaviour).unsqueeze(-1)
+        if behaviour.requires_grad:
+            raise ValueError(
+                f"{keys.sample_log_prob!r} has a gradient, which cancels that of the policy: "
+                "collect batches under torch.no_grad()."
+            )
+        return (now - behaviour).unsqueeze(-1)
 
     def _kl(
         self, tensordict: TensorDictBase, distribution: Distribution, log_weight: Tensor

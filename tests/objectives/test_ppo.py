@@ -120,6 +120,16 @@ def test_reductions():
     torch.testing.assert_close(samples.mean(), mean)
 
 
+def test_a_batch_with_the_gradient_of_its_policy_is_refused():
+    """As TorchRL's rollouts are outside of no_grad: the gradient of the ratio would be 0."""
+    actor = make_actor()
+    batch = actor(make_batch(actor, [16]))
+    assert batch["action_log_prob"].requires_grad
+    with pytest.raises(ValueError, match=r"'action_log_prob' has a gradient.*torch\.no_grad"):
+        PPOLoss(actor, **SETTINGS)(batch)
+    PPOLoss(actor, **SETTINGS)(batch.detach())
+
+
 def test_errors_say_what_to_change():
     actor = make_actor()
     batch = make_batch(actor, [16])
