@@ -8,10 +8,10 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from safe_rl.objectives.gae import gae
 from safe_rl.objectives.samples import require, sample_mask
+from safe_rl.objectives.shared_tensors import SharesTensors
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ def critic_bias(
     return difference / torch.where(weight > 0, weight, torch.nan)
 
 
-class CriticLoss(LossModule):
+class CriticLoss(SharesTensors):
     """Squared errors of a reward critic and, if there is one, of a cost critic.
 
     Returns ``loss_critic`` and ``loss_cost_critic`` (summed over the k costs), whose sum is to be

@@ -14,6 +14,7 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 from safe_rl.objectives.samples import require, sample_mask
+from safe_rl.objectives.shared_tensors import SharesTensors
 from safe_rl.objectives.violation import KnownCosts
 from safe_rl.ranges import Checked
 
@@ -46,7 +47,7 @@ Distance = Literal["l2", "smooth_l1", "l1"]
 """Distance of a prediction from its target, see `torchrl.objectives.utils.distance_loss`."""
 
 
-class ReplayLoss(Checked, LossModule):
+class ReplayLoss(Checked, SharesTensors):
     """Interface of losses on steps from a replay buffer, for the off-policy recipe and its update.
 
     Attributes:
@@ -209,24 +210,9 @@ class QFunctionLoss(ReplayLoss):
         self.gamma = hyperparams.get("gamma", self.gamma)
         return made
 
-    def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        moved = super()._apply(*args, **kwargs)
-        self._share_tensors()
-        return moved
-
-    def _share_tensors(self) -> None:
-        """Let networks share the loss's tensors again, after a copy or a move."""
-        for name in ("actor_network", "qvalue_network", "cost_qvalue_network"):
-            if (params := self._modules.get(f"{name}_params")) is not None:
-                params.to_module(self.__dict__[name])
-
     def __getstate__(self) -> dict[str, Any]:
         # a copy must not have the cached parameters, which belong to the original loss
         return {name: x for name, x in self.__dict__.items() if not name.startswith("_cache")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self._share_tensors()
 
 
 def discount_of(tensordict: TensorDictBase, gamma: float, spanned: NestedKey) -> Tensor | float:

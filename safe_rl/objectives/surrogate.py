@@ -10,7 +10,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor
 from torch.distributions import Distribution
-from torchrl.objectives import LossModule
 
 from safe_rl.objectives.distributions import (
     composite_keys,
@@ -21,6 +20,7 @@ from safe_rl.objectives.distributions import (
 )
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import inputs_of, require, sample_mask
+from safe_rl.objectives.shared_tensors import SharesTensors
 from safe_rl.ranges import Checked, NotNegative
 
 
@@ -53,7 +53,7 @@ def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Ten
     return log_size.exp() / (log_weight.numel() if mask is None else mask.sum())
 
 
-class SurrogateLoss(Checked, LossModule):
+class SurrogateLoss(Checked, SharesTensors):
     """Base of the policy losses: subclasses turn log-ratios into surrogates.
 
     It reads a batch of any shape, [B] or [N, T], with normalised advantages; padding is ignored. It
