@@ -98,12 +98,6 @@ def cells_of(folders):
     return [" / ".join(final), f"{mean_cost:.1f}", percent(above), kept(folders)]
 
 
-@pytest.mark.parametrize("env", ENVIRONMENTS)
-def test_older_runs_of_td3_lagrangian(env):
-    runs = [RESULTS / "off_policy" / env / "td3_lagrangian" / f"seed{n}" for n in (300, 301, 302)]
-    assert f"| {env} | `td3_lagrangian` | 300 to 302 | {' | '.join(cells_of(runs))} |" in PAGE
-
-
 @pytest.mark.parametrize("algo", OFF_POLICY_ONES)
 def test_the_limit_from_200_000_steps_on(algo):
     cells = []
