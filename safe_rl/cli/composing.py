@@ -201,6 +201,7 @@ def _check(config: DictConfig, overrides: Sequence[Override]) -> None:
         with resolving(config):
             OmegaConf.select(config, "hydra.run.dir")  # it refers to keys that every run has
             _check_read(overrides, config)
+            _check_names(overrides, config)
             check_settings(config)
             complete_env(plain(config)["env"])
             _check_top(config)
@@ -223,6 +224,20 @@ def _check_read(overrides: Sequence[Override], config: DictConfig) -> None:
             if f"{override.key_or_group.replace('/', '.')}.".startswith(f"{path}."):
                 verb = f"algo={config.algo.get('name')} {'has no' if choice else 'does not read'}"
                 raise CommandLineError(f"'{override.input_line}': {verb} '{unread}'. {reason}")
+
+
+def _check_names(overrides: Sequence[Override], config: DictConfig) -> None:
+    """Refuse ``env.name`` and ``algo.name`` of another choice: they only name what is chosen."""
+    known = {"env": env_names(), "algo": [file.stem for file in (CONF / "algo").glob("*.yaml")]}
+    for override in overrides:
+        group, _, key = override.key_or_group.partition(".")
+        if key == "name" and group in known:
+            chosen, name = config.hydra.runtime.choices[group], config[group].name
+            if name in known[group] and name != chosen:
+                raise CommandLineError(
+                    f"'{override.input_line}' would train {group}={chosen} under the name of "
+                    f"another one. To choose that one, write {group}={name}."
+                )
 
 
 def _check_top(config: DictConfig) -> None:

@@ -137,6 +137,8 @@ KEYS = {path: Parameter(values_of(kind), meaning) for path, (kind, meaning) in _
 """Full key -> its description; all keys but those of parts and environments."""
 _ELSEWHERE = {
     **dict.fromkeys(("total_timesteps", "total_steps", "timesteps", "max_steps"), "frames"),
+    **dict.fromkeys(("environment", "environment_name", "env_name", "env_id", "task"), "env"),
+    **dict.fromkeys(("algorithm", "algo_name"), "algo"),
     **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
 }
 """Name of a key in other libraries -> the key."""
@@ -204,7 +206,7 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
         return f"there is no key '{key}'.{reason}"
     if section != "preset" and (choice := _choice_with(key)):  # a preset's keys are at the top
         target = str((values.get(section) or {}).get("_target_") or "safe_rl.")
-        own = f": {target} has no such argument. Choose your class by a YAML file ({section}=…)."
+        own = f": {target} has no such argument, or the YAML file of {section}=… does not name it."
         reason = f" without {choice}." if target.startswith("safe_rl.") else own
         return f"there is no key '{key}'{reason}"
     known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(values))

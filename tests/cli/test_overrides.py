@@ -25,6 +25,10 @@ RIGHT = [
 WRONG = {
     "env.hazard_num=3": r"there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
     "total_timesteps=3": "there is no key 'total_timesteps'. Did you mean 'frames'",
+    "environment=PointGoal2": "there is no key 'environment'. Did you mean 'env'",
+    "algo_name=cpo": "there is no key 'algo_name'. Did you mean 'algo'",
+    "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
+    "algo.name=cpo": "would train algo=ppo_lagrangian under the name of .*write algo=cpo",
     "preset.frames=3": "there is no key 'preset.frames'. Did you mean 'frames'",
     "frmaes=3": "there is no key 'frmaes'. Did you mean 'frames'",
     "+lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
