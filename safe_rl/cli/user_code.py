@@ -76,11 +76,18 @@ def _import(name: str, given: str) -> str:
                 f"import={given}: there is no module '{error.name}' here or among the installed "
                 f"ones. A file is named by its path: import=folder/{error.name}.py."
             ) from None
-        *_, last = traceback.extract_tb(error.__traceback__)
+        frames = traceback.extract_tb(error.__traceback__)
+        # the user's own line, not the line of this package that refuses its arguments
+        own = [frame for frame in frames if not _is_inner(frame.filename)]
+        place = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
         raise CommandLineError(
-            f"import={given}: {type(error).__name__}: {error} "
-            f"({last.filename}, line {last.lineno})."
+            f"import={given}: {type(error).__name__}: {error}{place}."
         ) from error
+
+
+def _is_inner(file: str) -> bool:
+    """Whether code is of this package or of Python's import."""
+    return file.startswith(str(Path(targets.__file__).parent)) or "importlib" in file
 
 
 def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **options: Any) -> Any:

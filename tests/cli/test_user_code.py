@@ -72,6 +72,8 @@ def test_modules_are_found_by_name_and_by_file(folder):
         ("users_nowhere.py", "import=users_nowhere.py: there is no such file"),
         ("users_broken", r"ZeroDivisionError: .*users_broken.py, line 2\)"),
         ("users_needy", "ModuleNotFoundError: No module named 'users_nowhere'.*line 1"),
+        ("users_refused", r"must start with 'cost_'.*users_refused\.py, line 2\)"),
+        ("users_unread", r"SyntaxError: '\(' was never closed \(users_unread\.py, line 1\)\.$"),
         ("json.py", "another module of that name"),
         ("json", "another module of that name"),
     ],
@@ -79,6 +81,11 @@ def test_modules_are_found_by_name_and_by_file(folder):
 def test_errors_are_one_line(folder, module, message):
     (folder / "users_broken.py").write_text("x = 1\n1 / 0\n")
     (folder / "users_needy.py").write_text("import users_nowhere\n")
+    (folder / "users_refused.py").write_text(
+        "from safe_rl.envs.extending import Cost, register_cost\n"
+        "register_cost(Cost(key='speed', active=bool, magnitude=max))\n"
+    )
+    (folder / "users_unread.py").write_text("x = (\n")
     (folder / "json.py").write_text("")
     with pytest.raises(CommandLineError, match=message) as error:
         import_modules([module])
