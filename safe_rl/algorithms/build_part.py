@@ -13,13 +13,15 @@ from typing import Any, TypeVar
 import torch
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import Recipe
 from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, check_cost_limits
+from safe_rl.objectives import Multiplier
 from safe_rl.parameters import accepted_names
 from safe_rl.targets import TargetError, build, locate
 
-Update = TypeVar("Update")
+Part = TypeVar("Part")
 
 _DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
 
@@ -46,22 +48,43 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
         TargetError: If the target may not be built, or if building it fails.
     """
     names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
-    return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
+    try:
+        return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
+    except TargetError as error:
+        wants_multiplier = "missing" in str(error) and "'multiplier'" in str(error)
+        if wants_multiplier and objects.get("multiplier", error) is None:
+            raise TargetError(
+                f"{error}. The algorithm has no multiplier: add '- /lagrangian: ${{preset}}' to "
+                "the defaults of its YAML file."
+            ) from error
+        raise
 
 
-def build_update(node: DictConfig, kind: type[Update], **objects: Any) -> Update:
+def build_update(node: DictConfig, kind: type[Part], **objects: Any) -> Part:
     """Build an update of networks, as `build_part` does.
 
     Raises:
         TargetError: As in `build_part`, or if the result is no update of this kind.
     """
-    update = build_part(node, **objects)
-    if not isinstance(update, kind):
+    return _of_kind(build_part(node, **objects), kind, node, "update", "safe_rl.algorithms")
+
+
+def build_loss(node: DictConfig, **objects: Any) -> LossModule:
+    """Build a loss, as `build_part` does.
+
+    Raises:
+        TargetError: As in `build_part`, or if the result is no loss module.
+    """
+    return _of_kind(build_part(node, **objects), LossModule, node, "loss", "torchrl.objectives")
+
+
+def _of_kind(part: Any, kind: type[Part], node: DictConfig, name: str, home: str) -> Part:
+    if not isinstance(part, kind):
         raise TargetError(
-            f"{node._get_full_key(None)}._target_={node._target_} is no update: derive it from "
-            f"safe_rl.algorithms.{kind.__name__}."
+            f"{node._get_full_key(None)}._target_={node._target_} is no {name}: derive it from "
+            f"{home}.{kind.__name__}."
         )
-    return update
+    return part
 
 
 def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> dict[str, float]:
@@ -100,13 +123,17 @@ def build_constraints(
     Lengths of episodes are in decisions (time steps of a batch), schedules in environment steps.
 
     Raises:
+        TargetError: If the multiplier is no `Multiplier`.
         ValueError: If a risk measure is named without a tracker.
     """
     multiplier = risk = None
     per_decision = env.steps_per_decision
     max_length = math.ceil(env.max_episode_steps / per_decision)
     if config.get("lagrangian") is not None:
-        multiplier = build_part(config.lagrangian, cost_limits=limits).to(device)
+        node = config.lagrangian
+        built = build_part(node, cost_limits=limits)
+        multiplier = _of_kind(built, Multiplier, node, "multiplier", "safe_rl.objectives")
+        multiplier = multiplier.to(device)
     values = torch.tensor(list(limits.values()))
     if limits and _names_a_part(config.get("risk")):
         risk = build_part(config.risk, cost_limits=values, steps_per_decision=per_decision)

@@ -25,7 +25,7 @@ def sum_of_losses(losses: TensorDictBase) -> Tensor:
     """Sum of the entries that are named ``loss_…``, a scalar.
 
     Raises:
-        ValueError: If one of them is not a single number.
+        ValueError: If there is none, or one of them is not a single number.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -33,7 +33,16 @@ def sum_of_losses(losses: TensorDictBase) -> Tensor:
         >>> sum_of_losses(losses.set("entropy", torch.tensor(5.0)))
         tensor(3.)
     """
+    if not isinstance(losses, TensorDictBase):
+        raise ValueError(
+            f"A loss must return a TensorDict with entries named 'loss_…', got {type(losses)}."
+        )
     terms = {name: value for name, value in losses.items() if name.startswith(_PREFIX)}
+    if not terms:
+        raise ValueError(
+            "A loss must return an entry named 'loss_…': the sum of these entries is minimised. "
+            f"It returned {sorted(losses.keys())}."
+        )
     for name, value in terms.items():
         if value.numel() != 1:
             raise ValueError(

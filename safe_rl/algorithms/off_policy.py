@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm, Recipe, Stateful
 from safe_rl.algorithms.build_part import (
     build_constraints,
+    build_loss,
     build_part,
     build_update,
     constrained_limits,
@@ -103,7 +104,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         device = torch.device(config.device)
         networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env, device)
-        loss = build_part(
+        loss = build_loss(
             config.loss,
             actor_network=networks["actor"],
             qvalue_network=networks.get("critic"),

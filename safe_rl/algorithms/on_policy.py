@@ -23,6 +23,7 @@ from safe_rl.algorithms.algorithm_contract import (
 )
 from safe_rl.algorithms.build_part import (
     build_constraints,
+    build_loss,
     build_part,
     build_update,
     constrained_limits,
@@ -198,7 +199,7 @@ def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
 
 def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
     """The update of the policy: ``policy_update`` on ``loss``, then the pairs in ``then``."""
-    loss = build_part(config.loss, **parts)
+    loss = build_loss(config.loss, **parts)
     others = {name: part for name, part in parts.items() if name != "actor_network"}
     update = build_update(config.policy_update, PolicyUpdate, loss=loss, **others)
     then = config.get("then") or {}

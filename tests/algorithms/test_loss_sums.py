@@ -30,6 +30,13 @@ def test_a_loss_of_every_sample_is_named(shape):
     assert sum_of_losses(TensorDict(loss_a=torch.ones(1), loss_b=torch.tensor(2.0))) == 3
 
 
+def test_what_is_no_mapping_of_losses_is_told():
+    with pytest.raises(ValueError, match=r"a TensorDict with entries named 'loss_…', got .*Tensor"):
+        sum_of_losses(torch.tensor(1.0))
+    with pytest.raises(ValueError, match=r"an entry named 'loss_…'.*It returned \['objective'\]"):
+        sum_of_losses(TensorDict(objective=torch.tensor(1.0)))
+
+
 def test_a_sum_beyond_all_numbers_is_said_to_be_one():
     huge = torch.tensor(3e38)
     losses = TensorDict(loss_actor=huge, loss_qvalue=huge.clone())

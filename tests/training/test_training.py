@@ -194,9 +194,9 @@ class ReportingUpdate(PolicyUpdate):
 
 
 class ForeignUpdate:
-    """What is called like an update and does not fulfil its contract."""
+    """What is called like a part and does not fulfil its contract."""
 
-    def __init__(self, loss): ...
+    def __init__(self, **objects): ...
 
     def __call__(self, batch, cost_violation, episode_length):
         return {}
@@ -265,9 +265,33 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
         assert table[f"policy_violation_{key}"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_an_update_of_another_kind_is_refused_when_it_is_built(tmp_path):
-    own = own_algorithm(tmp_path, OWN_UPDATE.replace("Reporting", "Foreign"))
-    said = r"ForeignUpdate is no update: derive it from safe_rl\.algorithms\.PolicyUpdate"
+FOREIGN = "test_training.ForeignUpdate"
+(LOSS,) = (line for line in OWN_UPDATE.splitlines() if line.startswith("loss:"))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            OWN_UPDATE.replace("Reporting", "Foreign"),
+            r"ForeignUpdate is no update: derive it from safe_rl\.algorithms\.PolicyUpdate",
+        ),
+        (
+            OWN_UPDATE.replace(LOSS, f"loss: {{_target_: {FOREIGN}}}"),
+            r"ForeignUpdate is no loss: derive it from torchrl\.objectives\.LossModule",
+        ),
+        (
+            f"{OWN_UPDATE}lagrangian: {{_target_: {FOREIGN}}}",
+            r"ForeignUpdate is no multiplier: derive it from safe_rl\.objectives\.Multiplier",
+        ),
+        (
+            OWN_UPDATE.replace("PPOLoss", "PPOLagrangianLoss"),
+            r"missing .* 'multiplier'\. .* add '- /lagrangian: \$\{preset\}' to the defaults",
+        ),
+    ],
+)
+def test_a_part_that_does_not_fit_is_refused_when_it_is_built(tmp_path, text, said):
+    own = own_algorithm(tmp_path, text)
     with pytest.raises(ValueError, match=said):
         point_mass_trainer(tmp_path / "run", *own, minibatch_size=None)
 
