@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from inspect import signature
 from typing import Any
 
 import torch
@@ -64,7 +65,12 @@ def make_env(
     build = SafetyGymEnv if target is None else locate(target, key="env._target_")
     if isinstance(env, Mapping):
         env = {key: value for key, value in env.items() if key not in ("_target_", "name")}
-    made = build(env, num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)
+    given: dict[str, Any] = {
+        "num_envs": num_envs, "device": device, "seed": seed, "num_threads": num_threads
+    }  # fmt: skip
+    if target is not None:
+        _check_arguments(build, target, env, given)
+    made = build(env, **given)
     if transforms:
         made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
     if target is not None or transforms:
@@ -75,6 +81,19 @@ def make_env(
             "'num_envs' of them."
         )
     return made
+
+
+def _check_arguments(
+    build: Callable[..., Any], target: str, env: Any, given: Mapping[str, Any]
+) -> None:
+    """Refuse a function that does not take what every family is given."""
+    try:
+        signature(build).bind(env, **given)
+    except TypeError as error:
+        raise ContractError(
+            f"{target}: {error}. It is called with the keys of env as the first argument, and with "
+            f"{', '.join(given)} by name."
+        ) from None
 
 
 def _named(name: str) -> str | dict[str, Any]:

@@ -29,6 +29,12 @@ def make_small(config, *, num_envs, **others):
     return VelocityEnv({"robot": "hopper", **config}, num_envs=min(num_envs, 3))
 
 
+def make_few(config, num_envs): ...
+
+
+make_few.__module__ = "my_family"
+
+
 @pytest.fixture
 def my_family(monkeypatch):
     module = types.ModuleType("my_family")
@@ -55,6 +61,9 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
     assert make_env(node, num_envs=3).batch_size == (3,)
     with pytest.raises(ContractError, match=r"made 3 environments instead of 4.*'num_envs'"):
         make_env(node, num_envs=4)
+    sys.modules["my_family"].make_small = make_few
+    with pytest.raises(ContractError, match=r"'device'\. It is called with .* num_envs, device, "):
+        make_env(node)
 
 
 @pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])

@@ -158,7 +158,7 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
             f"Unknown environment '{env}'.{did_you_mean(name, named)} The suite has "
             "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
             "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and {name}Vision "
-            "for each of them."
+            "for each of them. safe_rl.envs.make_env makes all others, also yours."
         )
     return named[name]
 
