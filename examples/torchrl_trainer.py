@@ -26,7 +26,7 @@ from torchrl.trainers.trainers import ValueEstimatorHook
 from safe_rl.algorithms import Constraints, CPOStep, MinibatchUpdate
 from safe_rl.algorithms.torchrl_trainers import ConstraintHook, UpdateStepper
 from safe_rl.collectors import EpisodeAccounting, make_collector
-from safe_rl.envs import SafetyGymEnv
+from safe_rl.envs import make_env
 from safe_rl.models import make_actor, make_critic
 from safe_rl.objectives import (
     ActorCriticLoss,
@@ -141,7 +141,7 @@ def main(arguments: list[str] | None = None) -> Trainer:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(arguments)
     torch.manual_seed(args.seed)
-    env = SafetyGymEnv(args.env, num_envs=args.num_envs, seed=args.seed)
+    env = make_env(args.env, num_envs=args.num_envs, seed=args.seed)
     trainer = TRAINERS[args.algo](env, {"cost": args.limit}, args.frames, args.frames_per_batch)
     trainer.train()
     history = trainer._log_dict

@@ -163,7 +163,7 @@ def test_constraints_that_charge_steps_are_refused():
 
 def test_the_command_of_the_example(example, capsys, monkeypatch):
     monkeypatch.setattr(
-        example, "SafetyGymEnv", lambda name, num_envs, seed: PointMass(num_envs, 20, seed)
+        example, "make_env", lambda name, num_envs, seed: PointMass(num_envs, 20, seed)
     )
     trainer = example.main(["--frames=160", "--frames-per-batch=80", "--num-envs=4"])
     assert trainer.collected_frames == 160
