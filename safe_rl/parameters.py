@@ -117,6 +117,13 @@ def accepted_names(target: Callable[..., Any]) -> set[str]:
     return {name for name, *_ in _arguments(target)}
 
 
+def required_names(target: Callable[..., Any]) -> set[str]:
+    """Names of the arguments that a function or a class takes and that have no default."""
+    own_last = reversed([*_arguments(target)])
+    defaults = {name: parameter.default for name, parameter, _ in own_last}
+    return {name for name, default in defaults.items() if default is inspect.Parameter.empty}
+
+
 @cache
 def parameters_of(target: Callable[..., Any]) -> Mapping[str, Parameter]:
     """Arguments of a function or class by name.

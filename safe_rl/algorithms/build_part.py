@@ -18,7 +18,7 @@ from torchrl.objectives import LossModule
 from safe_rl.algorithms.algorithm_contract import Recipe
 from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, check_cost_limits
 from safe_rl.objectives import Multiplier
-from safe_rl.parameters import accepted_names
+from safe_rl.parameters import accepted_names, required_names
 from safe_rl.targets import TargetError, build, locate
 
 Part = TypeVar("Part")
@@ -47,17 +47,15 @@ def build_part(node: DictConfig, **objects: Any) -> Any:
     Raises:
         TargetError: If the target may not be built, or if building it fails.
     """
-    names = accepted_names(locate(node.get("_target_"), f"{node._get_full_key(None)}._target_"))
-    try:
-        return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
-    except TargetError as error:
-        wants_multiplier = "missing" in str(error) and "'multiplier'" in str(error)
-        if wants_multiplier and objects.get("multiplier", error) is None:
-            raise TargetError(
-                f"{error}. The algorithm has no multiplier: add '- /lagrangian: ${{preset}}' to "
-                "the defaults of its YAML file."
-            ) from error
-        raise
+    target = locate(node.get("_target_"), f"{node._get_full_key(None)}._target_")
+    names = accepted_names(target)
+    has_none = "multiplier" in objects and objects["multiplier"] is None
+    if has_none and "multiplier" in required_names(target):
+        raise TargetError(
+            f"{node._get_full_key(None)}._target_={node._target_} needs a multiplier, and the "
+            "algorithm has none: add '- /lagrangian: ${preset}' to the defaults of its YAML file."
+        )
+    return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
 
 
 def build_update(node: DictConfig, kind: type[Part], **objects: Any) -> Part:

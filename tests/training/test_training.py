@@ -286,7 +286,7 @@ FOREIGN = "test_training.ForeignUpdate"
         ),
         (
             OWN_UPDATE.replace("PPOLoss", "PPOLagrangianLoss"),
-            r"missing .* 'multiplier'\. .* add '- /lagrangian: \$\{preset\}' to the defaults",
+            r"PPOLagrangianLoss needs a multiplier, .* add '- /lagrangian: \$\{preset\}' to the",
         ),
     ],
 )
