@@ -114,6 +114,18 @@ def test_a_million_steps_with_a_replay_buffer(algo):
     assert f"| `{algo}` | {' | '.join(ends)} |\n" in OFF_POLICY
 
 
+@pytest.mark.parametrize("env", ["PointGoal1", "PointGoal2"])
+def test_how_much_too_high_the_cost_critics_of_sac_lagrangian_are(env):
+    spans = []
+    for run in seeds_of(RESULTS / "held_out" / env / "sac_lagrangian"):
+        values = run_at(run).table["policy_cost_qvalue"][-100:]  # half a million steps
+        # discounted costs of 0.99 and episodes of 1,000 steps
+        spans.append((np.mean(values) * 1000 * (1 - 0.99), last(run, 1 / 6)[1]))
+    said, paid = ([f"{f(x):.0f}" for f in (min, max)] for x in zip(*spans, strict=True))
+    words = rf"{said[0]} to {said[1]} on {env}, where (episodes|they) cost {paid[0]} to {paid[1]}\b"
+    assert re.search(words, sentences(OFF_POLICY))
+
+
 def quarters_of(steps, returns, costs):
     """Means over each quarter million of steps."""
     quarters = (steps - 1) // 250_000
