@@ -140,8 +140,14 @@ _ELSEWHERE = {
     **dict.fromkeys(("environment", "environment_name", "env_name", "env_id", "task"), "env"),
     **dict.fromkeys(("algorithm", "algo_name"), "algo"),
     **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
+    **dict.fromkeys(("clip", "clip_ratio", "clip_range", "clip_coef"), "clip_epsilon"),
+    **dict.fromkeys(("discount", "discount_factor"), "gamma"),
+    **dict.fromkeys(("epochs", "n_epochs", "num_epochs", "update_iters"), "num_passes"),
+    **dict.fromkeys(("lam", "gae_lambda"), "lmbda"),
+    **dict.fromkeys(("learning_rate", "actor_lr", "pi_lr"), "lr"),
+    "target_kl": "max_kl",
 }
-"""Name of a key in other libraries -> the key."""
+"""Name of a key in other libraries -> the key, or its last part."""
 _LIKENESS = 0.6
 """Similarity from which on a key counts as a misspelling of another one."""
 
@@ -212,8 +218,10 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
     known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(values))
     read = [path for path in known if path != key and not f"{path}.".startswith(unread)]
     held = [path for path in read if known[path]]
-    elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
-    meant = elsewhere or _nearest_keys(key, held) or _nearest_keys(key, read)
+    section, _, name = key.rpartition(".")
+    is_own = any(path.endswith(f".{name}") for path in read)
+    ours = key if is_own else join_keys(section, _ELSEWHERE.get(name, name))
+    meant = _nearest_keys(ours, held) or _nearest_keys(ours, read) or [ours] * (ours != key)
     names = " or ".join(f"'{'' if known.get(path, True) else '+'}{path}'" for path in meant)
     how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
     return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"
