@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts, lagrangian
+from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts
 from safe_rl.ranges import Fraction
 
 #: Which surrogates PPO clips besides that of the reward; see `PPOLagrangianLoss`.
@@ -122,22 +122,19 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
         return -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
 
     def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        if self.cost_clipping != "joint" or self.multiplier is None:
+        if self.cost_clipping != "joint":
             return super()._objective(tensordict, log_weight)
-        advantage = lagrangian(
-            self._advantage(tensordict, log_weight),
-            self._cost_advantage(tensordict),
-            self.multiplier.value,
-        )
+        advantage = self._penalised_advantage(tensordict, log_weight)
+        advantage = advantage / (1 + self.multiplier.value.sum())
         return clipped_gain(log_weight, advantage, self.clip_epsilon)
 
 
 class RCPOLoss(WeighsCosts, PPOLoss):
     """PPO on the penalised reward r − Σᵢ λᵢ cᵢ (Tessler et al. 2019, definition 3).
 
-    Its advantage is Â = A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs. A single critic of r
-    − λc would lag behind changes of λ. The objective is clipped as a whole, min(ρÂ, clip(ρ)Â). The
-    multiplier should change slowly (the third time scale of the article). Arguments are a
+    Its advantage is Â = A − Σᵢ λᵢ A_cᵢ, from the critics of reward and costs. A single critic, of
+    r − λc, would lag behind changes of λ. The objective is clipped as a whole, min(ρÂ, clip(ρ)Â).
+    The multiplier should change slowly (the third time scale of the article). Arguments are a
     multiplier, with one λ per column of ``cost_advantage``, and those of `PPOLoss`.
 
     Examples:
@@ -150,11 +147,9 @@ class RCPOLoss(WeighsCosts, PPOLoss):
         True
     """
 
-    def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        return self._penalised_advantage(tensordict, log_weight)
-
-    def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
-        return reward_gain  # the costs are in the advantage already
+    def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        advantage = self._penalised_advantage(tensordict, log_weight)
+        return clipped_gain(log_weight, advantage, self.clip_epsilon)
 
 
 class TRPOLoss(SurrogateLoss):
@@ -195,8 +190,8 @@ class CPOLoss(SurrogateLoss):
     """Surrogates of CPO: ``loss_objective`` = −E[ρ A] and ``cost_surrogate`` = E[ρ A_c], [k].
 
     Both have gradients. The cost surrogates are constraints, not losses: a
-    `safe_rl.algorithms.CPOStep` keeps them within their limits, and needs the mean over the samples
-    (``reduction``). Arguments are those of `SurrogateLoss`.
+    `safe_rl.algorithms.CPOStep` keeps them within their limits. They are means over the samples for
+    any ``reduction``. Arguments are those of `SurrogateLoss`.
 
     Examples:
         >>> from safe_rl.models import make_actor
@@ -210,8 +205,9 @@ class CPOLoss(SurrogateLoss):
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         ratio = log_weight.exp()
-        costs = (ratio * self._cost_advantage(tensordict)).unbind(-1)
         return {
             "loss_objective": -ratio * self._advantage(tensordict, log_weight),
-            "cost_surrogate": torch.stack([self._reduce_loss(cost, tensordict) for cost in costs]),
+            "cost_surrogate": self._cost_surrogates(
+                tensordict, ratio * self._cost_advantage(tensordict)
+            ),
         }

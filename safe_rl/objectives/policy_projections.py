@@ -147,7 +147,6 @@ class CUPLoss(WeighsCosts):
     def _evaluate(
         self, tensordict: TensorDictBase, log_weight: Tensor, divergence: Tensor
     ) -> dict[str, Tensor]:
-        assert self.multiplier is not None
         gain = self._cost_gain(tensordict, log_weight.exp())
         penalty = (gain * self.multiplier.value).sum(-1, keepdim=True)
         scale = 1 + self.cost_factor * self.multiplier.value.sum()

@@ -123,7 +123,7 @@ class SurrogateLoss(Checked, SharesTensors):
     def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Prepare a batch before the first step of an update, and return it.
 
-        A loss that is relative to the policy at that moment stores that policy's parameters.
+        A loss that is measured relative to the present policy stores that policy's parameters.
         """
         return tensordict
 
@@ -258,13 +258,6 @@ class SurrogateLoss(Checked, SharesTensors):
         """Cost surrogates per sample, [..., k]."""
         return ratio * self._cost_advantage(tensordict)
 
-    def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""
-        assert self.multiplier is not None
-        advantage = SurrogateLoss._advantage(self, tensordict, log_weight)
-        weighed = self._cost_advantage(tensordict) * self.multiplier.value
-        return advantage - weighed.sum(-1, keepdim=True)
-
 
 class WeighsCosts(SurrogateLoss):
     """Mixin for a policy loss without costs: adds costs, weighted by a multiplier.
@@ -277,6 +270,8 @@ class WeighsCosts(SurrogateLoss):
     Raises:
         TypeError: If there is no multiplier.
     """
+
+    multiplier: Multiplier
 
     def __init__(
         self,
@@ -291,3 +286,8 @@ class WeighsCosts(SurrogateLoss):
                 f"{multiplier!r}: without constraints use PPOLoss or TRPOLoss."
             )
         self.multiplier = multiplier
+
+    def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
+        """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""
+        weighed = self._cost_advantage(tensordict) * self.multiplier.value
+        return self._advantage(tensordict, log_weight) - weighed.sum(-1, keepdim=True)
