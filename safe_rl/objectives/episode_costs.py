@@ -7,9 +7,9 @@ points of their episodes (``staggered_starts``), and the policy must not change.
 the same part of an episode, the rate is that of this part. For a batch of many whole episodes the
 estimate *is* their mean cost.
 
-T̄ is the number of steps per end of an episode in the last batches. A mean over the episodes that
-have ended would be too low while episodes grow longer, by a factor of two to five: the long
-episodes have not ended yet, and there are many short episodes from before.
+T̄ is the number of steps in the last batches, divided by the number of episodes that ended in them.
+While episodes grow longer, the mean length of the ended episodes would be too low, by a factor of
+two to five. Most long episodes have not ended yet, and many of the ended ones are short.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
     """
     variance = past.error.square() + drift.square()
     noise = present.error.square()
-    # if no estimate has an error, the present one is right
+    # if both errors and the drift are 0, the new estimate is exact
     weight = torch.where(variance + noise > 0, variance / (variance + noise), 1.0)
     mean = torch.lerp(past.mean, present.mean, weight)
     error = ((1 - weight) * variance).sqrt()
@@ -92,11 +92,11 @@ def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEsti
 
 
 class EpisodeLengths(Resumable):
-    """Mean episode length T̄: steps per end of an episode, over the last 100 ends or a few more.
+    """Mean episode length T̄: steps per ended episode, over the last 100 ends or a few more.
 
-    Counting starts just after a batch in which episodes ended. So batches without ends count too,
-    and make T̄ larger. T̄ is at most the largest possible length, and equal to it until an episode
-    has ended earlier.
+    The counted steps begin after a batch in which episodes ended. Later batches without such ends
+    count too, and make T̄ larger. T̄ is at most the largest possible length, and equal to it until
+    an episode has ended before this length.
 
     Args:
         longest: Largest possible length of an episode in steps.
@@ -196,8 +196,8 @@ class EpisodeCosts(Resumable):
         drift: Expected relative change of J_c from one policy to the next; it sets the weights of
             past batches and of the new one. None uses the new batch alone.
         memory: Weight in [0, 1) of the past in the estimated variance of costs.
-        smallest: Costs per step, of size `unit`: the drift is relative to at least this J_c.
-            Otherwise an estimate of 0 could not change any more.
+        smallest: Costs per step, of size `unit`. The drift is relative to J_c, or to the J_c of
+            this many costs if it is larger. Otherwise an estimate of 0 could never change again.
         largest_correlation: Upper bound of the correlation of successive batches, which makes
             standard errors larger; see `NoiseCorrelation`.
 
@@ -280,10 +280,10 @@ class EpisodeCosts(Resumable):
     def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
         """Standard error of a batch, expected from earlier batches, for J_c of this size, [k].
 
-        Costs come in clusters: a batch with few of them by chance also has a small spread. Weighted
-        by its own error, it would count more than a batch with many costs, and the estimate would
-        be too low. So the variance is taken to be proportional to J_c, as for counts, and the
-        factor of proportionality is estimated.
+        Costs come in clusters. A batch that has few costs by chance also has a small standard
+        error. With this error as its weight, it would count more than a batch with many costs, and
+        the estimate would be too low. So the variance is assumed to be proportional to J_c, as for
+        counts. The factor of proportionality is estimated.
         """
         seen = torch.stack([batch.error.square(), self._size(batch.mean)])
         self._scatter = torch.lerp(seen, self._scatter, self.memory)
