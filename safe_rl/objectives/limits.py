@@ -124,12 +124,12 @@ class LimitTracker(Checked, Resumable):
     Args:
         cost_limits: Limits d, undiscounted cost per episode, [k].
         max_length: Largest length of an episode, in time steps of a batch.
-        margin: How far below the limit the target is, in standard errors of a batch's J_c.
+        margin: Distance of the target below the limit, in standard errors of a batch's J_c.
         largest_margin: Upper bound of the margin, as a share of d.
         free_steps: Environment steps at the start during which costs have no effect.
         descent_steps: Environment steps, after free_steps, during which the limit falls to d.
-        recovery: Share of d that is the target once J_c is above d, until J_c has reached it; 1 for
-            none. C-TRPO has the same hysteresis as a part of its step.
+        recovery: Share of d that becomes the target when J_c exceeds d. It stays the target until
+            J_c has fallen to it. 1: the target stays d. C-TRPO's step has such a hysteresis itself.
         steps_per_decision: Environment steps per time step of a batch, which is one action.
         frames: Environment steps of the whole run.
         latest_end: Share of the run at which the descent ends at the latest. In a shorter run,
@@ -140,10 +140,11 @@ class LimitTracker(Checked, Resumable):
         memory: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
         largest_correlation: Upper bound of the correlation r of the noise of successive batches;
             with 0, batches count as independent. r is measured from rows whose episodes span
-            batches. The variance of a batch is (1 + r) / (1 − r) times that of its rows.
-        descent_errors: Standard errors that are added to the estimate of J_c before the limit
-            follows it down. With 0 the limit follows the lowest of several noisy estimates, and
-            falls faster than the policy's cost.
+            batches. The variance of a batch's J_c, estimated from its rows, is multiplied by
+            (1 + r) / (1 − r).
+        descent_errors: Number of standard errors that is added to the estimate of J_c before the
+            falling limit follows it. With 0, the limit follows the lowest of several noisy
+            estimates, and so falls faster than the true cost of the policy.
         lowest_trust: Lower bound of trust_<cost>, the share of a predicted change of J_c that is
             expected to occur; 1 expects all of it.
         integral: Share of every violation that is added to the violations of all later updates (the
@@ -273,7 +274,7 @@ class LimitTracker(Checked, Resumable):
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
-        # the limit falls from the present cost, if that has already fallen below the limit
+        # if the cost is already below the falling limit, the limit continues from the cost
         present = estimate.mean + self.descent_errors * estimate.error
         self._reached = torch.minimum(self._reached, present)
         self._reached = descend(self._reached, self.limits - margin, share)
