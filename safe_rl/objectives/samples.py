@@ -36,10 +36,11 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
 
 
 def inputs_of(network: TensorDictModuleBase, batch: TensorDictBase) -> TensorDictBase:
-    """The inputs of a network, as a copy in which the network may write.
+    """A copy of the inputs of a network, into which the network may write.
 
-    If a policy writes the parameters of a composite distribution one by one, below ``"params"``,
-    this entry is among its inputs. Without a copy it would replace those of the behaviour policy.
+    A policy may write the parameters of a composite distribution one by one, below ``"params"``.
+    Then ``"params"`` is also one of its inputs. Without a copy, it would overwrite the behaviour
+    policy's parameters in the batch.
     """
     return batch.select(*network.in_keys).copy()
 
@@ -60,7 +61,7 @@ def sample_mask(tensordict: TensorDictBase, loss: Any = None) -> Tensor | None:
 
 
 def mask_keys(loss: Any = None) -> tuple[NestedKey, ...]:
-    """Keys of the masks that a loss applies; those of TorchRL if it is no `LossModule`."""
+    """Keys of the masks that a loss applies; TorchRL's if it is not a `LossModule`."""
     return loss._loss_mask_keys() if isinstance(loss, LossModule) else AUTO_LOSS_MASK_KEYS
 
 
