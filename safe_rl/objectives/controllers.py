@@ -17,8 +17,8 @@ class PIMultiplier(Multiplier):
 
     λ = clip(K_P Δ + I, 0, highest) and I ← clip(I + K_I Δ, 0, highest), with Δ = (J_c − d) / scale
     and |Δ| ≤ saturation. The integral stops at the bounds of λ (anti-windup by clamping). Without
-    the bound on Δ, a cost of six times the limit would raise the integral several times as fast as
-    a cost of 0 lowers it.
+    the bound on Δ, a cost of six times the limit would raise the integral five times as fast as a
+    cost of 0 lowers it.
 
     `docs/algorithms/holding_the_limit.md` explains how gains set the period and the damping.
 
@@ -88,8 +88,8 @@ class PIDMultiplier(Multiplier):
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
         kd: Derivative gain K_D.
-        proportional_ema: Weight of the past in the smoothed error Δ; 0 is no smoothing.
-        derivative_ema: Weight of the past in the smoothed cost J; 0 is no smoothing.
+        proportional_ema: Weight of the past in the smoothed error Δ; 0: not smoothed.
+        derivative_ema: Weight of the past in the smoothed cost J; 0: not smoothed.
         derivative_delay: Number of updates over which the growth of the cost is measured.
         scale: Unit of the errors: one number, one per cost, or ``"limit"`` for the limits
             themselves, which makes the gains independent of a cost's units. The paper uses 1.

@@ -25,10 +25,10 @@ class CostCritics(QFunctionLoss):
 
     A policy that minimises Q_c exploits actions whose cost is underestimated, and bootstrapping
     spreads such errors. Against this, TD targets use mean_E Q' + κ' std_E Q' over an ensemble of E
-    networks: for E = 2 and κ' = 1, the larger of the two. The actor's loss gets the penalty
-    r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, where u_i is the typical size of one cost and r the
-    standard deviation of rewards: with λ = 1, one cost weighs as much as a reward of size r. Loss
-    and penalty are divided by 1 + Σ λ_i / u_i, so that the step size does not grow with λ.
+    networks. For E = 2 and κ' = 1, this is the larger of the two values. The actor's loss gets the
+    penalty r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, where u_i is the typical size of one cost
+    and r the standard deviation of rewards. So with λ = 1, one cost weighs as much as a reward of
+    size r. Loss and penalty are divided by 1 + Σ λ_i / u_i: the step size does not grow with λ.
 
     In a class definition it comes before the loss without costs. The critic loss has to call
     `cost_qvalue_loss`, and the actor loss `penalised`.

@@ -156,7 +156,7 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
 def composite_keys(
     sampler: ProbabilisticTensorDictModule,
 ) -> tuple[list[NestedKey], list[NestedKey]] | None:
-    """Keys of the parts' actions and log-probabilities; None if it is no composite distribution."""
+    """Keys of the parts' actions and log-probabilities; None if it is not composite."""
     made = sampler.distribution_class
     made = made.func if isinstance(made, partial) else made
     if made is not CompositeDistribution:

@@ -9,11 +9,11 @@ from torchrl.objectives import LossModule
 
 
 class SharesTensors(LossModule):
-    """Base of losses whose networks share the loss's tensors, also after a copy or a move.
+    """Base of losses that share their tensors with their networks, also after a copy or a move.
 
-    A loss of TorchRL has parameters and buffers apart from its networks, which share them when it
-    is built. After ``copy.deepcopy`` they no longer do, so that the copy would train tensors that
-    its networks don't have. After a move the networks would keep their earlier buffers.
+    A loss of TorchRL stores the parameters and buffers of its networks separately. When it is
+    built, loss and networks share them. After ``copy.deepcopy`` they do not: training the copy
+    would not change its networks. After a move, the networks would have their old buffers.
     """
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:

@@ -34,9 +34,10 @@ class KnownCosts(Violations, Protocol):
 
 
 def matched_violation(violation: Tensor | None, surrogates: Tensor) -> Tensor:
-    """J_c − d in the type and on the device of the cost surrogates, [k].
+    """J_c − d with the dtype and the device of the cost surrogates, [k].
 
-    Before the first batch J_c is NaN, which counts as 0: the policy is assumed to be at its limits.
+    Before the first batch, violations are NaN. They count as 0: the policy is assumed to be exactly
+    at its limits.
 
     Args:
         violation: J_c − d of every constraint, [k].
