@@ -41,9 +41,10 @@ def _is_of_use() -> bool:
 def fast_products() -> Iterator[None]:
     """Let torch multiply matrices by oneDNN inside the block, on processors where it is faster.
 
-    Use it for updates, whose minibatches have thousands of rows. A call takes some ten microseconds
-    more, which is too much for the few rows that a policy acts on. Sums differ in their last
-    digits. A setting of the caller (``torch.backends.mkldnn.matmul.fp32_precision``) is kept.
+    Use it for updates, whose minibatches have thousands of rows. Each product takes about ten
+    microseconds longer to start, which is too much for the few rows of a policy that acts. Sums
+    differ in their last digits. If ``torch.backends.mkldnn.matmul.fp32_precision`` has been set,
+    this setting is kept.
 
     Examples:
         >>> with fast_products():
@@ -75,16 +76,17 @@ def torch_threads(number: int) -> Iterator[None]:
 
 
 def in_parallel(first: Callable[[], Any], second: Callable[[], Any]) -> tuple[Any, Any]:
-    """Call two functions that share nothing they change, each with half of torch's threads.
+    """Call two functions at the same time, each with half of torch's threads.
 
-    With narrow networks, the computations of one minibatch are too small for two threads, so it is
-    faster to run two updates at the same time. With one thread, the second function follows the
-    first. TorchRL's exploration type is DETERMINISTIC meanwhile, as in its losses. Both functions
-    have ended on return, even if one of them raises an error.
+    Neither function may change data that the other one uses. With narrow networks, one minibatch is
+    too little work for two threads, so two updates at the same time are faster. If torch has only
+    one thread, the functions are called one after the other. During the calls TorchRL's exploration
+    type is DETERMINISTIC, as in its losses. Both functions have ended when this one returns or
+    raises an error.
     """
     threads = torch.get_num_threads()
-    # Losses set the exploration type, of which a process has only one, and then restore it. In two
-    # threads, one would restore what the other has set. So it is set before both and restored here.
+    # Losses set the exploration type and then restore the previous one. It is global, so of two
+    # threads one could restore the type that the other has set. Here it is set once for both.
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         if threads == 1:
             return first(), second()
