@@ -30,7 +30,7 @@ def find_recipe(config: DictConfig) -> type[Recipe]:
     """The recipe that a configuration names as ``algo._target_``; by default `OnPolicy`.
 
     Raises:
-        TargetError: If there is no such class, or it is no recipe.
+        TargetError: If there is no such class, or it is not a recipe.
     """
     target = config.algo.get("_target_", _DEFAULT_RECIPE)
     recipe = locate(target, "algo._target_")
@@ -42,7 +42,9 @@ def find_recipe(config: DictConfig) -> type[Recipe]:
 
 
 def build_part(node: DictConfig, **objects: Any) -> Any:
-    """Build what a node names; its constructor gets the `objects` that it names, but no None.
+    """Build the object that a node names, from the node's settings and objects of the run.
+
+    Its constructor gets those of the `objects` that are among its arguments and are not None.
 
     Raises:
         TargetError: If the target may not be built, or if building it fails.
@@ -62,7 +64,7 @@ def build_update(node: DictConfig, kind: type[Part], **objects: Any) -> Part:
     """Build an update of networks, as `build_part` does.
 
     Raises:
-        TargetError: As in `build_part`, or if the result is no update of this kind.
+        TargetError: As in `build_part`, or if the result is not an update of this kind.
     """
     return _of_kind(build_part(node, **objects), kind, node, "update", "safe_rl.algorithms")
 
@@ -71,7 +73,7 @@ def build_loss(node: DictConfig, **objects: Any) -> LossModule:
     """Build a loss, as `build_part` does.
 
     Raises:
-        TargetError: As in `build_part`, or if the result is no loss module.
+        TargetError: As in `build_part`, or if the result is not a loss module.
     """
     return _of_kind(build_part(node, **objects), LossModule, node, "loss", "torchrl.objectives")
 
@@ -121,7 +123,7 @@ def build_constraints(
     Lengths of episodes are in decisions (time steps of a batch), schedules in environment steps.
 
     Raises:
-        TargetError: If the multiplier is no `Multiplier`.
+        TargetError: If the multiplier is not a `Multiplier`.
         ValueError: If a risk measure is named without a tracker.
     """
     multiplier = risk = None
