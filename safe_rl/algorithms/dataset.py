@@ -26,8 +26,9 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
     to the environment's bounds.
 
     Returns:
-        A sentence on the data that the run learns from, or a warning that it will learn nothing,
-        or an empty text; and whether transitions that the run collects are added to the buffer.
+        Two values. The first is a sentence on the data that the run learns from, a warning that it
+        will learn nothing, or an empty text. The second is whether transitions that the run
+        collects are added to the buffer.
 
     Raises:
         ValueError: If ``dataset.alone`` is true without a path; if transitions do not fit the
@@ -56,7 +57,7 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
 
 
 def _other_environment(config: DictConfig) -> str:
-    """A warning if a recording is in the folder of a run of another environment; else empty."""
+    """A warning if the recording is of a run in another environment; else an empty text."""
     try:
         name = read_config(Path(config.dataset.path).parent / "config.yaml")["env"]["name"]
     except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
