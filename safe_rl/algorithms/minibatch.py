@@ -160,10 +160,10 @@ class MinibatchUpdate(PolicyUpdate):
         """Take the gradient steps on ``batch``, of any shape; padding is not used.
 
         Returns:
-            Means over the steps of all that the loss reports, except for ``kl``: this is the last
-            value measured, from after the last step if ``max_kl`` ended the update without
-            ``step_beyond_kl``, else from before the last step. Also ``num_steps``, the gradient
-            steps taken, and ``lr``, the next learning rate, if it is adapted.
+            Means over the steps of everything that the loss reports, except for ``kl``. This is the
+            last measured value. It is measured after the last step if ``max_kl`` ended the update
+            without ``step_beyond_kl``, and before the last step otherwise. Also ``num_steps``, the
+            number of gradient steps, and ``lr``, the next learning rate, if it is adapted.
         """
         history: list[TensorDictBase] = []
         num_steps = 0
