@@ -33,7 +33,7 @@ def bounded_actions(env: EnvBase) -> TensorSpec:
     """Spec of one environment's bounded action, [A], in single precision like the networks.
 
     Raises:
-        ValueError: If actions are not continuous within finite bounds, or no vectors [A].
+        ValueError: If actions are not vectors [A] of continuous numbers within finite bounds.
     """
     spec = env.action_spec_unbatched
     is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
@@ -68,8 +68,8 @@ def build_networks(
         device: Device of the parameters.
 
     Raises:
-        ValueError: If actions have no bounds, the observation is no vector, or the model is one for
-            on-policy algorithms.
+        ValueError: If actions have no bounds, the observation is not a vector, or the model is for
+            on-policy algorithms only.
     """
     model, spec = config.model, bounded_actions(env)
     size, actions = _observation_size(config, env), len(spec.low)
@@ -89,7 +89,7 @@ def build_networks(
 
 
 def _observation_size(config: DictConfig, env: EnvBase) -> int:
-    """Length of the observation; refuses models and observations that are not of one vector."""
+    """Length of the observation, one vector; refuses other observations, and on-policy models."""
     model = config.model
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
         raise ValueError(
