@@ -17,8 +17,8 @@ from safe_rl.ranges import Fraction, NotNegative
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
     """Bregman divergence, for x log x, between two distances of a cost to its limit.
 
-    D(s − a, s) = a + (s − a) log((s − a)/s): 0 with a slope of 0 at a = 0, of curvature 1/s there,
-    and infinite beyond the limit.
+    D(s − a, s) = a + (s − a) log((s − a)/s). At a = 0, its value and its slope are 0 and its
+    curvature is 1/s. Beyond the limit it is infinite.
 
     Args:
         change: Increase a of the cost, any shape.
