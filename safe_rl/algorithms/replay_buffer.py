@@ -19,7 +19,10 @@ from safe_rl.resumable import Resumable
 _MOST_AT_ONCE = 16_384
 """Largest number of transitions that are sampled in one call and then cut into minibatches."""
 _LONGEST_ROW = 1_000
-"""Time steps per call of TorchRL's n-step transform, which goes through all for every episode."""
+"""Largest number of time steps per call of TorchRL's n-step transform.
+
+For every episode the transform reads all steps of the call, so long rows would take too long.
+"""
 
 
 class Memory(Checked):

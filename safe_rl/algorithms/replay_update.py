@@ -47,7 +47,7 @@ class ReplayUpdate(Checked):
             Steps of optimisers without a setting ``capturable``, such as SGD, are never recorded.
 
     Raises:
-        TypeError: If the loss is no `ReplayLoss`.
+        TypeError: If the loss is not a `ReplayLoss`.
         ValueError: If an argument is outside its range, no parameter's name begins with a key of
             ``rates``, or the loss has target networks and ``tau`` is None.
         FloatingPointError: By the call, if a loss is not finite: before the step on this loss, or
