@@ -72,8 +72,8 @@ class Proposal(NamedTuple):
 
     Attributes:
         step: Change of the parameters, [P].
-        is_acceptable: Function of the losses and of the KL divergence, at most δ, after a step:
-            whether the line search may take this step.
+        is_acceptable: Tells whether the line search may take a step, from the losses and the KL
+            divergence after it. Only steps with a KL divergence of at most δ are passed.
         diagnostics: Values to log about the step.
     """
 
