@@ -48,7 +48,7 @@ def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
     """Read a regular file of at most ``most`` bytes.
 
     Raises:
-        ValueError: If it is larger, or no regular file: reading a pipe could wait for ever.
+        ValueError: If it is larger, or not a regular file: reading a pipe could wait forever.
         OSError: If it cannot be read.
     """
     if not path.is_file() and path.exists():
@@ -64,7 +64,7 @@ def read_json(path: Path) -> Any:
     """Read a JSON file of bounded size.
 
     Raises:
-        ValueError: If it is no JSON, is too large, or nested too deeply.
+        ValueError: If it is not JSON, is too large, or nested too deeply.
         OSError: If it cannot be read.
     """
     try:
@@ -77,8 +77,8 @@ def read_yaml(path: Path) -> Any:
     """Read a YAML file as plain dictionaries, lists and values, without aliases.
 
     Raises:
-        ValueError: If it is no YAML, is too large or nested too deeply, or has aliases: with them a
-            small file could fill the memory.
+        ValueError: If it is not YAML, is too large or nested too deeply, or has aliases, with which
+            a small file could fill the memory.
         OSError: If it cannot be read.
     """
     try:
@@ -110,7 +110,7 @@ def read_config(path: Path) -> dict[str, Any]:
     this machine into a report.
 
     Raises:
-        ValueError: If it is no mapping whose keys are texts, or has interpolations, control
+        ValueError: If it is not a mapping whose keys are texts, or has interpolations, control
             characters or aliases.
         OSError: If it cannot be read.
 

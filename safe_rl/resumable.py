@@ -41,7 +41,7 @@ class Resumable:
         """Restore what :meth:`state_dict` has returned.
 
         Raises:
-            ValueError: If the saved value of a number is no number of the same type.
+            ValueError: If a number was saved as a value of another type.
         """
         for name in self.state_names:
             own = getattr(self, name)

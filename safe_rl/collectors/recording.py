@@ -74,7 +74,8 @@ class Recording:
         Args:
             number: Number of the batch in order of time.
             batch: Consecutive steps.
-            begun: Rows [N] that start within an episode; partial after a batch missing or cut.
+            begun: Rows [N] that start within an episode, bool. If the batch before is missing or
+                was cut off, these episodes are marked as partial.
         """
         steps = batch.select(*self._keys).cpu()
         steps[PARTIAL] = torch.zeros_like(steps["next", "done"])
@@ -87,7 +88,7 @@ class Recording:
         self._store(number, steps)
 
     def cut_after(self, number: int) -> None:
-        """Truncate a batch's unfinished episodes and mark them as partial: new ones follow."""
+        """Truncate a batch's unfinished episodes, mark them as partial; new episodes follow."""
         self._cut = number
         if not self._place(number).exists():
             return

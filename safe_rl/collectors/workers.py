@@ -43,9 +43,9 @@ def split_rows(
 
     Their first episodes begin at ``first_steps`` [N], by default at step 0.
 
-    If the environment has states that can be copied (``get_state``), workers continue its rows from
-    their next reset. Otherwise every worker makes a new environment with a seed of its own, whose
-    schedules continue after the ``steps_before`` of ``env``.
+    If the environment has a state that can be copied (``get_state``), workers continue its rows,
+    from the next reset on. Otherwise every worker makes a new environment with its own seed. The
+    schedules of the new environment continue after the ``steps_before`` of ``env``.
     """
     states: list[TensorDictBase | None]
     if env.get_state() is None:
@@ -148,8 +148,8 @@ class WorkerCollector:
         try:
             self._workers = self._ask(self._start)
         except BaseException as error:
-            # At its exit, Python would wait for workers that have started, and for the objects that
-            # send weights to them. The frames of the error keep these objects alive.
+            # When Python exits, it would wait for the workers that have started, and for the
+            # objects that send weights to them, which the frames of the error keep alive.
             for process in set(active_children()) - others:
                 process.kill()
             clear_frames(error.__traceback__)

@@ -33,7 +33,8 @@ Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 _SCALE_FLOOR = 1e-6
 # Logit of choices that do not exist: probability 0, with finite gradients.
 _NO_CHOICE = -1e9
-# Single precision rounds to 0 and 1, where Beta densities are zero or infinite.
+# Samples of a Beta distribution keep this distance from 0 and 1, where densities are 0 or infinite.
+# In single precision they may be rounded to 0 and 1.
 _EDGE = 1e-6
 
 

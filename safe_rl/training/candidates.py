@@ -20,8 +20,8 @@ def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int
     """Epochs from a policy's update until the finished episodes are, on average, its own.
 
     A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
-    began before it. Half an episode later, the finished episodes are centred on this batch. Returns
-    and costs are averaged over a number of epochs, `over`.
+    began before it. Those that end half an episode length after the batch are centred on it.
+    Returns and costs are averaged over a number of epochs, `over`.
 
     Examples:
         >>> epochs_until_judged(over=1, length=1000, steps_per_epoch=1000)
@@ -56,8 +56,8 @@ class Candidates(Resumable):
         components: Parts of the run, by name, that a checkpoint of a policy has.
         limits: Cost key -> d, undiscounted cost per episode.
         over: Number of epochs over which returns and costs are averaged.
-        delay: Function from the mean episode length to the number of epochs from a policy's update
-            to the last epoch of its average.
+        delay: Function of the mean episode length. It returns how many epochs after its update a
+            policy is judged.
         longest: Largest length of an episode, used as the mean length until an episode has ended.
 
     Attributes:
