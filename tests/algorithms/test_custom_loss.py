@@ -2,6 +2,7 @@
 
 import math
 
+import custom_loss
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
@@ -10,16 +11,11 @@ from tensordict import TensorDict
 
 from safe_rl import targets
 from safe_rl.algorithms import Constraints
-from safe_rl.cli.user_code import import_modules
 from safe_rl.models import make_actor
 from safe_rl.runs.table import read_table
 from safe_rl.targets import allow
 
 EXAMPLES = CONF.parent / "examples"
-import_modules([str(EXAMPLES / "custom_loss.py")])
-
-import custom_loss  # noqa: E402
-
 allow("custom_loss")
 
 

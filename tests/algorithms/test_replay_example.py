@@ -1,20 +1,14 @@
 """The script with TorchRL's own collector and buffer runs, with multipliers that episodes move."""
 
-import importlib.util
 import math
-from pathlib import Path
 
 import pytest
-
-PATH = Path(__file__).parents[2] / "examples" / "replay_buffer.py"
+import replay_buffer
 
 
 def test_the_losses_fit_torchrls_collector_and_buffer(capsys):
-    spec = importlib.util.spec_from_file_location("replay_buffer", PATH)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     sizes = ["--num-envs=4", "--frames=12000", "--frames-per-batch=4000", "--updates-per-batch=20"]
-    rows = module.main(["--limit=0", *sizes])
+    rows = replay_buffer.main(["--limit=0", *sizes])
     assert len(rows) == 3
     assert [row["episodes"] for row in rows] == [4, 4, 4]
     assert rows[0]["multiplier"] == pytest.approx(0.15 * min(rows[0]["episode_cost"], 0.5))

@@ -1,11 +1,10 @@
 """TorchRL's trainers with our parts: the example trains, and the parts do what they say."""
 
-import importlib.util
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import torch
+import torchrl_trainer as example
 from point_mass import PointMass
 from samples import make_actor, make_batch, make_critic, perturb
 from tensordict import TensorDict
@@ -25,25 +24,15 @@ from safe_rl.objectives import (
     VectorGAE,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
 LIMITS = {"cost_hazards": 1.0, "cost_north": 0.5}
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
-
-
-@pytest.fixture(scope="module")
-def example():
-    path = ROOT / "examples" / "torchrl_trainer.py"
-    spec = importlib.util.spec_from_file_location("torchrl_trainer", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def weights(module):
     return [parameter.detach().clone() for parameter in module.parameters()]
 
 
-def test_ppo_lagrangian_in_torchrls_ppo_trainer(example):
+def test_ppo_lagrangian_in_torchrls_ppo_trainer():
     env = PointMass(num_envs=4, num_steps=20)
     trainer = example.ppo_lagrangian_trainer(env, LIMITS, frames=480, frames_per_batch=160)
     loss, before = trainer.loss_module, weights(trainer.loss_module)
@@ -63,7 +52,7 @@ def test_ppo_lagrangian_in_torchrls_ppo_trainer(example):
     torch.testing.assert_close(loss.policy_loss.multiplier.value, twin.value)
 
 
-def test_cpo_steps_in_torchrls_trainer(example):
+def test_cpo_steps_in_torchrls_trainer():
     env = PointMass(num_envs=4, num_steps=20)
     trainer = example.cpo_trainer(env, LIMITS, frames=480, frames_per_batch=160)
     actor, critics = trainer.loss_module.actor_network, trainer.loss_module.critic_loss
@@ -161,7 +150,7 @@ def test_constraints_that_charge_steps_are_refused():
         ConstraintHook(constraints, accounting)
 
 
-def test_the_command_of_the_example(example, capsys, monkeypatch):
+def test_the_command_of_the_example(capsys, monkeypatch):
     monkeypatch.setattr(
         example, "make_env", lambda name, num_envs, seed: PointMass(num_envs, 20, seed)
     )

@@ -1,9 +1,9 @@
 """README is one page, with the two commands that CI and readers carry out."""
 
 import re
-import sys
 from pathlib import Path
 
+import render_suite
 from PIL import Image
 
 from safe_rl.envs.families import env_names
@@ -11,9 +11,6 @@ from safe_rl.envs.families import env_names
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
 FAMILIES = ROOT / "docs" / "environments" / "suite.md"
-sys.path.insert(0, str(ROOT / "examples"))
-
-import render_suite  # noqa: E402
 
 
 def test_it_is_one_page():
