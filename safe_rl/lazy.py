@@ -18,7 +18,8 @@ def import_later(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return a package's ``__getattr__``, which imports names, and ``__dir__``, which lists them.
 
-    The package's class is changed, so that importing a module does not hide a function of its name.
+    It also changes the class of the package object. Otherwise, importing a module such as
+    ``safe_rl.evaluate`` would replace the package's function of the same name.
 
     Args:
         package: Name of the package.

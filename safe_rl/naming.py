@@ -32,8 +32,8 @@ def join_keys(above: str, name: str) -> str:
 def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str | None:
     """Return the known name that is most similar to `name`, or None if none is similar.
 
-    Names are similar from a ratio `likeness` of difflib's SequenceMatcher on. Capitals are ignored,
-    and hyphens count as underscores.
+    Names are similar if difflib's SequenceMatcher gives them a ratio of at least `likeness`.
+    Capitals are ignored, and hyphens count as underscores.
 
     Examples:
         >>> nearest("hazard_num", ["hazards_num", "vases_num"])

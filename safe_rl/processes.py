@@ -62,10 +62,11 @@ def starting_processes() -> Iterator[None]:
 
 
 def leave_signals_to_parent() -> None:
-    """End with the parent, or by its SIGTERM; ignore SIGINT, SIGHUP and other SIGTERMs.
+    """Let this process end when its parent ends or sends SIGTERM, and ignore other signals.
 
-    Call this in the main thread of a process that was started within :func:`starting_processes`.
-    Where the system does not tell the sender of a signal (macOS), any SIGTERM ends the process.
+    The other signals are SIGINT, SIGHUP, and SIGTERM from any other process. Call this function in
+    the main thread of a process that was started within :func:`starting_processes`. Where the
+    system does not tell the sender of a signal (macOS), any SIGTERM ends the process.
     """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

@@ -1,9 +1,10 @@
-"""How torch uses the processor: waiting of idle threads, and the kind of processor.
+"""How idle threads of torch wait, and a description of the processor.
 
-Imported before torch, because OpenMP reads the setting when torch is loaded. By default idle
-threads spin for milliseconds after every operation and take the cores from the physics and other
-programs: two training runs on two cores are then ten times slower than one, not twice. Sleeping at
-once costs a few microseconds per operation. A setting of the user is kept.
+This module has to be imported before torch, because OpenMP reads the setting when torch is loaded.
+By default, idle threads spin for milliseconds after every operation. So they take the cores from
+the physics and from other programs: of two training runs on two cores, each is then ten times
+slower than a single run. With the setting, idle threads sleep at once, which costs a few
+microseconds per operation. A setting of the user is kept.
 
 This is directly in ``safe_rl/``, because networks and updates both need the kind of processor.
 """

@@ -23,7 +23,7 @@ class Values(NamedTuple):
     Attributes:
         hold: Function that tells whether a value is one of them.
         words: Their description, to follow "it must be".
-        whole: Whether they are whole numbers. Then a float such as YAML's 3e5 is one, too.
+        whole: Whether they are whole numbers, which may be floats, such as YAML's 3e5.
 
     Examples:
         >>> even = Values(lambda value: value in (2, 4), "2 or 4")
