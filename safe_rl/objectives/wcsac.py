@@ -45,8 +45,9 @@ class WCSACLoss(SACLagrangianLoss):
     used.
 
     Args:
-        networks: Actor, Q functions and cost Q functions, as in `SACLagrangianLoss`. Of the last,
-            an even number, the first half are means, the second half variances before a softplus.
+        networks: Actor, Q functions and cost Q functions, as in `SACLagrangianLoss`. The number of
+            cost Q functions is even: the first half are means, the others variances before a
+            softplus.
         tail: Share α of the cost-returns, the highest ones, whose mean is limited (CVaR).
         pessimism: Number κ of standard deviations among the CVaR of several pairs of critics that
             is added to their mean.
