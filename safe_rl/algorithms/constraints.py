@@ -79,6 +79,7 @@ class Constraints(Resumable):
         self.unit = torch.ones_like(self.limits)
         self._finished = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
+        self._row: dict[str, float] = {}
 
     @property
     def held_limits(self) -> dict[NestedKey, float]:
@@ -115,6 +116,7 @@ class Constraints(Resumable):
         self.costs.copy_(costs)
         self.violation.copy_(costs - self.limits)
         self.episode_length.copy_(length)
+        self._row = self.column("violation", self.violation)
         if self.multiplier is not None and (goes_by_rate or episodes.num_episodes):
             self.multiplier.update(costs - self.limits)
 
@@ -122,8 +124,8 @@ class Constraints(Resumable):
         """Store the change of J_c that an update predicts."""
 
     def columns(self) -> dict[str, float]:
-        """Violations and multipliers, by name of their column in the run's table."""
-        row = self.column("violation", self.violation)
+        """Values of the last batch and multipliers, by name of their column in the run's table."""
+        row = dict(self._row)
         if self.multiplier is not None:
             row |= self.column("multiplier", self.multiplier.value)
         return row
@@ -210,7 +212,6 @@ class TrackedConstraints(Constraints):
         self.tracker, self.risk = tracker, risk
         self.schedule = tracker.schedule if self.keys else ""
         self._charges: Charges | None = None
-        self._row: dict[str, float] = {}
 
     def apply_risk(self, episodes: EpisodeStatistics, batch: TensorDictBase) -> None:
         """Write the costs of the risk measure below ``"next"``."""
@@ -257,10 +258,3 @@ class TrackedConstraints(Constraints):
         if "cost_surrogate" in metrics:
             change = metrics["cost_surrogate"] * self.episode_length
             self.tracker.predictions.record_prediction(change)
-
-    def columns(self) -> dict[str, float]:
-        """Estimates and targets of J_c, and multipliers or else trust, by name of their column."""
-        row = dict(self._row)
-        if self.multiplier is not None:
-            row |= self.column("multiplier", self.multiplier.value)
-        return row
