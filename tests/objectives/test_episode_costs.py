@@ -43,12 +43,6 @@ def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths(
     assert estimator.length == pytest.approx(7.2)
 
 
-def test_before_an_episode_has_finished_its_length_is_the_limit_of_steps():
-    estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
-    estimate = estimator.update(torch.full((5, 20, 1), 0.03), torch.empty(0))
-    torch.testing.assert_close(estimate.mean, torch.tensor([30.0]))
-
-
 def steps_of_a_policy(mean_lengths: list[float], rows: int, steps: int, longest: int = 1000):
     """Ends of episodes, batch by batch, of rows that fall with a chance of 1 / L per step."""
     generator = torch.Generator().manual_seed(5)
