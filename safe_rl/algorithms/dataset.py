@@ -12,7 +12,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.algorithms.off_policy_networks import bounded_actions, setting
+from safe_rl.algorithms.off_policy_networks import bounded_actions
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import read_dataset, safe_episodes
 from safe_rl.files import read_config
@@ -44,7 +44,7 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             )
         n = config.memory.get("n_steps", 1)  # the last n of a row wait for their n-step returns
         waiting = 0 if n == 1 else n * env.batch_size.numel() * env.steps_per_decision
-        needed = setting(config, "exploration.random_steps") + waiting
+        needed = config.exploration.random_steps + waiting
         frames = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
         warning = (
             f"Nothing will be learned: the run has {frames:,} steps, and learning begins after "

@@ -23,12 +23,7 @@ from safe_rl.algorithms.build_part import (
 )
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.dataset import fill_replay_buffer
-from safe_rl.algorithms.off_policy_networks import (
-    bounded_actions,
-    build_networks,
-    exploring,
-    setting,
-)
+from safe_rl.algorithms.off_policy_networks import bounded_actions, build_networks, exploring
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
@@ -125,10 +120,10 @@ class OffPolicy(Resumable, Algorithm, Recipe):
             device=device,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
-        random_steps = setting(config, "exploration.random_steps") if collects else 0
+        random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
         return cls(
-            policy=exploring(networks["actor"], env, setting(config, "exploration.noise")),
+            policy=exploring(networks["actor"], env, config.exploration.noise),
             networks=networks,
             constraints=constraints,
             replay_buffer=buffer,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
@@ -15,18 +15,6 @@ from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
 
 _ON_POLICY_ONLY = ("encoders", "memory", "normalise")
-
-
-def setting(config: DictConfig, key: str) -> Any:
-    """The value of a required key.
-
-    Raises:
-        ValueError: If the key is missing or null.
-    """
-    value = OmegaConf.select(config, key)
-    if value is None:
-        raise ValueError(f"{key} is missing: off-policy algorithms need it.")
-    return value
 
 
 def bounded_actions(env: EnvBase) -> TensorSpec:
@@ -80,9 +68,9 @@ def build_networks(
     }
     bounds = {"low": spec.low, "high": spec.high}
     networks = {"actor": build_part(config.actor, observation_size=size, **bounds, **common)}
-    if number := setting(config, "critics.rewards"):
+    if number := config.critics.rewards:
         networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
-    if num_costs and (number := setting(config, "critics.costs")):
+    if num_costs and (number := config.critics.costs):
         common |= {"num_outputs": num_costs, "out_key": "cost_state_action_value"}
         networks["cost_critic"] = QEnsemble(size, actions, num_networks=number, **common)
     return networks
