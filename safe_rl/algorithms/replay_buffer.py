@@ -205,8 +205,7 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
     priorities from a buffer's ``update_tensordict_priority``.
 
     Raises:
-        ValueError: If an exponent is negative, or, when samples are drawn, if the storage has more
-            than one dimension.
+        ValueError: When samples are drawn, if the storage has more than one dimension.
     """
 
     state_names = ("_priorities", "_largest")
@@ -215,8 +214,6 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
 
     def __init__(self, capacity: int, *, alpha: float, beta: float) -> None:
         # the constructor of the base class needs the extension
-        if min(alpha, beta) < 0:
-            raise ValueError(f"alpha={alpha} and beta={beta} must be at least 0.")
         self.alpha, self.beta = alpha, beta
         self._priorities = torch.zeros(capacity, dtype=torch.float64)
         self._largest = 1.0
