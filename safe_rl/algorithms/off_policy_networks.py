@@ -63,7 +63,7 @@ def build_networks(
     size, actions = _observation_size(config, env), len(spec.low)
     common: dict[str, Any] = {
         "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout, size),
         "device": device,
     }
     bounds = {"low": spec.low, "high": spec.high}

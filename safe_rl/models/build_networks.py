@@ -122,7 +122,7 @@ def _body(
         return Body(plain, num_outputs, widths, extra=recurrent_size, device=device)
     size = first.shape[0]
     if observed.clip is None:
-        scale = input_scale_vector(observed.input_scale, observed.layout)
+        scale = input_scale_vector(observed.input_scale, observed.layout, size)
         return perceptron(size, num_outputs, widths, scale, device)
     running = RunningScale(size, key=first.key, clip=observed.clip, device=device)
     return nn.Sequential(running, *perceptron(size, num_outputs, widths, None, device))

@@ -146,7 +146,7 @@ def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn
     size, widths = entry.shape[0], list(observed.encoders["vector"])  # type: ignore[index]
     # an entry of a dictionary may have the name "observation", too
     layout = observed.layout if entry.key == "observation" else {entry.name: slice(0, size)}
-    scale = input_scale_vector(observed.input_scale, layout)
+    scale = input_scale_vector(observed.input_scale, layout, size)
     layers: list[nn.Module] = []
     if observed.clip is not None:  # normalisation makes input scales unnecessary
         layers.append(RunningScale(size, key=entry.key, clip=observed.clip, device=device))

@@ -32,20 +32,22 @@ class InputScale(nn.Module):
         return inputs * self.scale
 
 
-def input_scale_vector(factors: Mapping[str, float], layout: Mapping[str, slice]) -> Tensor | None:
+def input_scale_vector(
+    factors: Mapping[str, float], layout: Mapping[str, slice], size: int
+) -> Tensor | None:
     """Convert factors per observation component to factors per column.
 
     Args:
         factors: Component name -> factor > 0. Other components have the factor 1.
         layout: Component name -> columns of the flat observation.
+        size: Number n of columns. If a transform stacks frames, each has the columns of `layout`.
 
     Returns:
-        Factors, shape [n] with n the number of columns, or None if no named component is observed.
-        A name that is not in ``layout`` is skipped, because robots with different sensors use the
-        same configuration.
+        Factors, shape [n], or None if no named component is observed. A name that is not in
+        ``layout`` is skipped, because robots with different sensors use the same configuration.
 
     Examples:
-        >>> input_scale_vector({"gyro": 0.5}, {"gyro": slice(0, 2), "lidar": slice(2, 3)})
+        >>> input_scale_vector({"gyro": 0.5}, {"gyro": slice(0, 2), "lidar": slice(2, 3)}, 3)
         tensor([0.5000, 0.5000, 1.0000])
     """
     observed = {name: factor for name, factor in factors.items() if name in layout}
@@ -54,7 +56,8 @@ def input_scale_vector(factors: Mapping[str, float], layout: Mapping[str, slice]
     scale = torch.ones(max(columns.stop for columns in layout.values()))
     for name, factor in observed.items():
         scale[layout[name]] = factor
-    return scale
+    frames, others = divmod(size, len(scale))
+    return torch.cat([scale.repeat(frames), torch.ones(others)])
 
 
 _CONSTANT = 1e-12  # a column with a variance up to this is constant

@@ -74,6 +74,15 @@ def test_entries_are_scaled_by_their_names():
     assert critic(observed.rand())["state_value"].shape == (3, 1)
 
 
+def test_frames_that_are_stacked_are_scaled_alike():
+    """The layout has the columns of one frame; TorchRL's `CatFrames` puts several in a row."""
+    observed = Composite(observation=Unbounded((3, 10)), shape=(3,))
+    layout = {"gyro": slice(0, 2), "lidar": slice(2, 5)}
+    critic = build(observed, layout=layout, input_scale={"gyro": 0.5})["critic"]
+    assert critic.module[0].scale.tolist() == 2 * [0.5, 0.5, 1.0, 1.0, 1.0]
+    assert critic(observed.rand())["state_value"].shape == (3, 1)
+
+
 def test_pictures_may_be_bytes_and_have_their_colours_first():
     observed = Composite(observation=Unbounded((3, 12, 15, 3)), shape=(3,))
     picture = torch.randint(256, (3, 12, 15, 3), dtype=torch.uint8)

@@ -106,7 +106,7 @@ def test_an_actor_of_somebody_elses_is_left_alone():
 
 def test_input_scale_is_fixed_saved_and_applied():
     scale = input_scale_vector(
-        {"gyro": 0.5, "absent": 9.0}, {"gyro": slice(3, 5), "lidar": slice(0, 3)}
+        {"gyro": 0.5, "absent": 9.0}, {"gyro": slice(3, 5), "lidar": slice(0, 3)}, 5
     )
     assert scale.tolist() == [1.0, 1.0, 1.0, 0.5, 0.5]
     scaled = make_critic(5, hidden_sizes=[6], input_scale=scale)
@@ -119,7 +119,7 @@ def test_input_scale_is_fixed_saved_and_applied():
     assert all(parameter is not scale for parameter in scaled.parameters())
     assert any(isinstance(module, InputScale) for module in scaled.modules())
     assert sum("scale" in name for name in scaled.state_dict()) == 1
-    assert input_scale_vector({"gyro": 0.5}, {"lidar": slice(0, 3)}) is None
+    assert input_scale_vector({"gyro": 0.5}, {"lidar": slice(0, 3)}, 3) is None
 
 
 def batches(number=4):
