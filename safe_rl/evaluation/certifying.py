@@ -72,14 +72,16 @@ class Certificate:
 
     def _on_rare_episodes(self) -> str:
         """Text on what the bounds say about rare episodes."""
+        said = []
+        if capped := ", ".join(name for name in self.verdict.bounds if name.startswith("beyond_")):
+            said.append(
+                f"Costs beyond a cap are not counted ({capped}: the share of such episodes)."
+            )
         if self.options.bound == "student":
-            return "The bound assumes that no rare episodes cost far more than those tested."
-        capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
-        if capped:
-            shares = ", ".join(capped)
-            return f"Costs beyond a cap are not counted ({shares}: the share of such episodes)."
-        most = ", ".join(f"{value:,.4g}" for name, value in self.verdict.highest.items()
-                         if not name.startswith("over_limit"))  # fmt: skip
+            said.append("The bound assumes that no rare episodes cost far more than those tested.")
+        if said:
+            return " ".join(said)
+        most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
         return f"The bound includes rare episodes that cost up to {most}."
 
 

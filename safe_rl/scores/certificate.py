@@ -206,7 +206,7 @@ class Verdict:
             (bound, limit).
         shortfalls: Of the same policy, if none is certified.
         means: Of the same policy: name -> mean over the episodes of its test.
-        highest: Of the same policy: name -> the largest possible value.
+        highest: Cost key -> the highest possible cost of an episode, where it is known.
         episodes: Episodes of its test.
     """
 
@@ -315,6 +315,6 @@ def _test(
         bounds=bounds,
         shortfalls=missing,
         means={one.name: float(one.values.mean()) if number else math.nan for one in statements},
-        highest={one.name: one.highest for one in statements},
+        highest=dict(claim.highest),
         episodes=number,
     )

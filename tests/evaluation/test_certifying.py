@@ -176,6 +176,8 @@ def test_a_limit_on_the_costliest_episodes_is_certified_for_them(train):
     assert (name, most) == ("cvar_cost", 19.0)
     plain = certify(directory, OPTIONS, make_env=make_env).verdict
     assert certificate.verdict.means["cvar_cost"] > plain.means["mean_cost"]
+    # the highest cost of an episode, not the highest value of the tested mean
+    assert certificate.verdict.highest == plain.highest == {"cost": 20.0}
 
 
 def test_what_an_episode_can_cost_is_known_from_the_environment():
@@ -207,9 +209,12 @@ def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
 
 def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_json(tmp_path):
     bounds = {"beyond_250_cost": (0.008, 0.01), "mean_cost": (math.inf, 25.0)}
-    verdict = Verdict(0, [0], bounds, {}, {"mean_cost": 9.0}, {"mean_cost": 250.0}, 700)
+    verdict = Verdict(0, [0], bounds, {}, {"mean_cost": 9.0}, {"cost": math.inf}, 700)
     certificate = Certificate(Path("checkpoint-000000000100.torchrl"), 1.0, verdict, OPTIONS)
-    assert "beyond a cap are not counted (beyond_250_cost: the share" in str(certificate)
+    student = replace(certificate, options=replace(OPTIONS, bound="student"))
+    for one in (certificate, student):
+        assert "beyond a cap are not counted (beyond_250_cost: the share" in str(one)
+    assert "assumes that no rare episodes cost far more" in str(student)
 
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
