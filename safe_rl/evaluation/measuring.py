@@ -58,7 +58,7 @@ class Evaluation:
         lines = [
             f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
             f"with {actions}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
-            *format_estimates(self.estimates, facts["cost_limits"]),
+            *format_estimates(self.estimates, facts["cost_limits"], facts["limited_measure"]),
             *format_unjudged(facts["limits_without_cost"]),
             *(f"wrote {path}" for path in self.files),
         ]
@@ -115,6 +115,7 @@ class Trial:
             record: Folder to which all steps are written; None: they are not recorded.
         """
         options = self.options
+        risk = OmegaConf.select(self.config, "risk._target_") or "mean"
         limits = {key: float(limit) for key, limit in self.config.cost_limits.items()}
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
             unjudged = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
@@ -138,6 +139,7 @@ class Trial:
             "seed": self.seed,
             "cost_limits": limits,
             "limits_without_cost": unjudged,
+            "limited_measure": risk.rpartition(".")[2],
         }
 
     def film(self, file: Path, **drawing: Any) -> None:
@@ -268,14 +270,15 @@ def summarise(
 
 
 def format_estimates(
-    estimates: Mapping[str, Estimate], cost_limits: Mapping[str, float]
+    estimates: Mapping[str, Estimate], cost_limits: Mapping[str, float], measure: str
 ) -> list[str]:
-    """Lines of a table for the terminal."""
+    """Lines of a table for the terminal; `measure` of an episode's cost is what is limited."""
     width = max(map(len, estimates))
+    other = "" if measure == "mean" else f" ({measure}, not mean)"
     lines = [f"{'':{width}}  estimate [95 % interval]"]
     for name, estimate in estimates.items():
         key = name.removeprefix("episode_")
-        limit = f"   limit {cost_limits[key]:g}" if key in cost_limits else ""
+        limit = f"   limit {cost_limits[key]:g}{other}" if key in cost_limits else ""
         lines.append(f"{name:{width}}  {estimate}{limit}")
     return lines
 

@@ -185,7 +185,7 @@ class Varied:
     def __str__(self) -> str:
         """Return and costs under every variation, as the command prints them."""
         keys = list(self.cost_limits) or ["cost"]
-        heads = ["", "return", *keys, *(f"over {d:g}" for d in self.cost_limits.values())]
+        heads = ["", "return", *keys, *(f"{k} over {d:g}" for k, d in self.cost_limits.items())]
         names = ["episode_return", *(f"episode_{key}" for key in keys)]
         names += [f"over_limit_{key}" for key in self.cost_limits]
         lines = [heads, *([str(v), *(str(e.get(n, "—")) for n in names)] for v, e in self.rows)]

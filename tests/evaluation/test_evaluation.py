@@ -155,3 +155,7 @@ def test_the_command_prints_a_table(run, capsys):
     line = next(line for line in shown.splitlines() if line.startswith("episode_cost "))
     assert line.endswith("limit 25")
     assert f"wrote {run}/evaluation.json" in shown
+    # a limit on another measure is not shown as one on the mean
+    change_config(run, risk={"_target_": "safe_rl.objectives.CVaR", "tail": 0.1})
+    assert main([str(run), "episodes=3", "num_envs=3", "num_threads=1"]) == 0
+    assert "   limit 25 (CVaR, not mean)\n" in capsys.readouterr().out

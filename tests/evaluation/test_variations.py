@@ -81,7 +81,8 @@ def test_variations_may_have_other_costs(run, capsys):
     assert has["episode_cost_low"] == ["as trained", "more", "free"]
     lines = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
     assert (lines["free"].count("—"), lines["more"].count("—")) == (2, 0)
-    assert "over 20" in lines["return"]
+    assert "cost over 25" in lines["return"]
+    assert "cost_hazards over 20" in lines["return"]
     # without the cost in all of them, the table has no place where its limit would be missed
     named = ("name=free", "env.constrain_hazards=false")
     assert main([str(run), "variations={more: {env.constrain_vases: true}}", *named, *QUICK]) == 0
