@@ -21,6 +21,15 @@ def pytest_runtest_setup(item):
         pytest.skip("no GPU here")
 
 
+@pytest.fixture
+def registrations_undone():
+    """For tests that register elements, tasks, costs, observations or robots."""
+    from registrations import undone  # here, because it imports every environment
+
+    with undone():
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _seed():
     """Every test starts from the same random state, whatever ran before it."""

@@ -81,4 +81,5 @@ def register_mines() -> None:
     register_cost(cost, keys={"constrain_mines": False, "mines_cost": 2.5})
 
 
+POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
 MINES = {"mines_num": 2, "observe_mines": True, "constrain_mines": True}

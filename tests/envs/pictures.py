@@ -49,5 +49,5 @@ def likeness(colour, rgb):
 
 
 def redness(colour):
-    """How much more red than anything else."""
-    return colour[0] - max(colour[1], colour[2])
+    """How much more red than anything else, of one colour or of every pixel of a frame."""
+    return colour[..., 0] - np.maximum(colour[..., 1], colour[..., 2])

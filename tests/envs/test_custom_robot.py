@@ -7,7 +7,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from registrations import undone
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv
@@ -230,12 +229,12 @@ def test_what_actuators_remember_is_part_of_a_state(make, kind):
     assert torch.equal(env.step(here.clone().set("action", idle))["next", "observation"], onward)
 
 
+@pytest.mark.usefixtures("registrations_undone")
 def test_registered_robots_are_made_by_name(make, tmp_path):
     make(BALL)
-    with undone():
-        register_robot("mine", tmp_path / "robot.xml")
-        env = SafetyGymEnv({"robot_base": "mine", "sensors_obs": ["gyro"]}, seed=0)
-        assert env.observation_layout == {"gyro": slice(0, 3)}
+    register_robot("mine", tmp_path / "robot.xml")
+    env = SafetyGymEnv({"robot_base": "mine", "sensors_obs": ["gyro"]}, seed=0)
+    assert env.observation_layout == {"gyro": slice(0, 3)}
     with pytest.raises(ConfigError, match=r"built-in robot"):
         register_robot("car", tmp_path / "robot.xml")
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from commands import ROOT, in_a_process
-from registrations import undone
 
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.table import read_table
@@ -24,9 +23,8 @@ SHORT = (
 
 
 @pytest.fixture
-def example():
-    with undone():
-        yield SimpleNamespace(**runpy.run_path(str(PATH)))
+def example(registrations_undone):
+    return SimpleNamespace(**runpy.run_path(str(PATH)))
 
 
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):

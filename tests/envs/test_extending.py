@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from crafting import arrange, step_from
-from registrations import MINES, cube, disc, inside, register_mines, undone
+from registrations import MINES, POINT, cube, disc, inside, register_mines
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, ConfigError, SafetyGymEnv
@@ -28,13 +28,7 @@ from safe_rl.envs.extending import (
 )
 from safe_rl.envs.safety_gym.tasks import TASKS
 
-POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
-
-
-@pytest.fixture(autouse=True)
-def _undone():
-    with undone():
-        yield
+pytestmark = pytest.mark.usefixtures("registrations_undone")
 
 
 def make(config: dict, num_envs: int = 1) -> SafetyGymEnv:

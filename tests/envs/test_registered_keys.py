@@ -7,7 +7,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
-from registrations import cube, disc, register_mines, undone
+from registrations import POINT, cube, disc, register_mines
 from run_configs import CONF
 
 from safe_rl.envs import (
@@ -31,13 +31,7 @@ from safe_rl.envs.extending import (
 )
 from safe_rl.ranges import Share
 
-POINT = {"robot_base": "point", "task": "none", "sensors_obs": ["gyro"]}
-
-
-@pytest.fixture(autouse=True)
-def _undone():
-    with undone():
-        yield
+pytestmark = pytest.mark.usefixtures("registrations_undone")
 
 
 def test_registered_keys_are_keys_like_the_others():

@@ -57,7 +57,6 @@ def test_a_step_has_its_cost_beside_the_reward():
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"id": None}, r"env\.id="),
         ({"id": "SafetyIce2-v0"}, "SafetyIce2-v0 is not registered"),
         ({"id": "my_ice:SafetyMine-v0"}, r"cannot import.*import=my_ice env.id=SafetyMine-v0"),
         ({"kwargs": {"speed": 3}}, "SafetyIce1-v0.*speed"),

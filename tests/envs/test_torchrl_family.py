@@ -147,7 +147,6 @@ def test_several_entries_become_a_vector_or_a_dictionary():
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"id": None}, r"env\.id="),
         ({"id": "PendulunEnv"}, "Did you mean 'PendulumEnv'.*import=torchrl.envs"),
         ({"num_steps": None}, "does not say how long"),
         ({"outside": None}, "what does a step cost"),

@@ -114,7 +114,6 @@ def test_every_environment_has_a_variant_with_vision():
         for robot in ("Point", "Car", "Doggo")
         for task in ("Run", "Run1", "Circle", "Circle1", "Circle2")
     )
-    assert len(SUITE) == 27
     for name in (*SUITE, *debug):
         config = resolve(f"Safexp-{name}Vision-v0")
         assert config == resolve(name).replace(observe_vision=True, observation_flatten=False)
