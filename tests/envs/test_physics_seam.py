@@ -49,15 +49,12 @@ class WaitingPhysics(Physics):
     def reset(self, mask):
         return self._call("reset", mask)
 
-    def forward(self, mask=None, sensors=True):
-        return self._call("forward", mask, sensors)
+    def forward(self, mask=None):
+        return self._call("forward", mask)
 
-    def step(self, num_substeps, mocap_path=None, refresh=True, counts=None):
+    def step(self, num_substeps, mocap_path=None, counts=None):
         path = None if mocap_path is None else mocap_path.double()
-        return self._call("step", num_substeps, path, refresh, counts)
-
-    def failed(self):
-        return self._call("failed")
+        return self._call("step", num_substeps, path, counts)
 
     def rays(self, origin, directions, group, exclude_body):
         distance = self._call("rays", origin.double(), directions.double(), group, exclude_body)

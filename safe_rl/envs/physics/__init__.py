@@ -15,7 +15,6 @@ STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_q
 """Tensors of the state, besides the memory of actuators and sensors."""
 MEMORY = ("act", "history")
 OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
-"""Outputs that are read by default."""
 
 
 class Physics(ABC):
@@ -40,9 +39,8 @@ class Physics(ABC):
         mocap_pos, mocap_quat: Poses of the mocap bodies [N, nmocap, 3] (m) and [N, nmocap, 4].
         memory: State of actuators and sensors with memory, `act` [N, na] and `history`
             [N, nhistory]; without entries that the model does not need.
-        xpos, xmat, sensordata, subtree_com: The default outputs, [N, nbody, 3] (m),
-            [N, nbody, 3, 3], [N, nsensordata] and [N, nbody, 3] (m).
-        outputs: All requested outputs, by their names in MuJoCo's `MjData`.
+        xpos, xmat, sensordata, subtree_com: The outputs, [N, nbody, 3] (m), [N, nbody, 3, 3],
+            [N, nsensordata] and [N, nbody, 3] (m).
     """
 
     device: torch.device
@@ -61,25 +59,20 @@ class Physics(ABC):
     xmat: Tensor
     sensordata: Tensor
     subtree_com: Tensor
-    outputs: Mapping[str, Tensor]
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` (bool [N]) to the model's initial state, awake."""
 
     @abstractmethod
-    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Compute the outputs from the state, for all simulations or those in `mask`.
-
-        Without `sensors`, the readings, and quantities that only sensors need, stay unchanged.
-        """
+    def forward(self, mask: Tensor | None = None) -> None:
+        """Compute the outputs from the state, for all simulations or those in `mask`."""
 
     @abstractmethod
     def step(
         self,
         num_substeps: int,
         mocap_path: Tensor | None = None,
-        refresh: bool = True,
         counts: Tensor | None = None,
     ) -> Tensor:
         """Advance by substeps under constant `ctrl`, then compute the outputs.
@@ -88,18 +81,12 @@ class Physics(ABC):
             num_substeps: Number of substeps, S.
             mocap_path: Mocap positions before each substep [N, S, nmocap, 3]; None if they do not
                 change.
-            refresh: False leaves the outputs as `mj_step` does: they belong to the last state that
-                the last substep evaluated, with the Runge-Kutta integrator its fourth stage.
             counts: A number of substeps for each simulation, at most S, int64 [N]; None means S.
 
         Returns:
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
             again, but meaningless until a reset.
         """
-
-    @abstractmethod
-    def failed(self) -> Tensor:
-        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
 
     @abstractmethod
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:

@@ -19,13 +19,6 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
-def _log_to_console_only() -> None:
-    """Keep MuJoCo from writing MUJOCO_LOG.TXT into the working directory."""
-    log = mujoco.MjLogConfig.get()
-    log.logto_file = False
-    log.set()
-
-
 def _share(array: np.ndarray) -> Tensor:
     """Wrap an array without copying it, and ignore torch's warning about read-only outputs."""
     with warnings.catch_warnings():
@@ -44,6 +37,9 @@ class BatchPhysics(Physics):
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
         outputs: Names of the fields of `MjData` that are read; every call copies them.
+
+    Attributes:
+        outputs: All of these fields, by name.
     """
 
     device = torch.device("cpu")
@@ -57,7 +53,9 @@ class BatchPhysics(Physics):
         num_threads: int,
         outputs: Sequence[str] = OUTPUTS,
     ) -> None:
-        _log_to_console_only()
+        log = mujoco.MjLogConfig.get()
+        log.logto_file = False  # or MuJoCo writes MUJOCO_LOG.TXT into the working directory
+        log.set()
         sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
         has_threads = (num_threads or os.cpu_count() or 1) > 1
         self._process = os.getpid() if has_threads else None
@@ -84,7 +82,10 @@ class BatchPhysics(Physics):
         self._warnings[:] = self._batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
-        """Compute the outputs from the state, see `Physics`."""
+        """Compute the outputs from the state, see `Physics`.
+
+        Without `sensors`, the readings, and quantities that only sensors need, stay unchanged.
+        """
         self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
         self._batch.forward(None if mask is None else mask.numpy())
@@ -94,10 +95,14 @@ class BatchPhysics(Physics):
         self,
         num_substeps: int,
         mocap_path: Tensor | None = None,
-        refresh: bool = True,
         counts: Tensor | None = None,
+        refresh: bool = True,
     ) -> Tensor:
-        """Advance by substeps and compute the outputs, see `Physics`."""
+        """Advance by substeps and compute the outputs, see `Physics`.
+
+        Without `refresh`, the outputs stay as `mj_step` leaves them. They belong to the last state
+        that the last substep evaluated: with the Runge-Kutta integrator, to its fourth stage.
+        """
         self._check_process()
         # Sensors are not read between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS
@@ -112,7 +117,7 @@ class BatchPhysics(Physics):
         return self.failed()
 
     def failed(self) -> Tensor:
-        """Return the simulations that failed since the last call, bool [N]."""
+        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
         # MuJoCo resets a bad state by itself, and only increments a warning counter.
         counts = self._batch.warning
         if np.array_equal(counts, self._warnings):

@@ -17,7 +17,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics.batch import BatchPhysics
 
 _STAGES = (0.5, 0.5, 1.0)  # times of the second, third and fourth stage, in substeps
 _SMALL_ANGLE = 1e-7  # rad; a lower bound of angles, against divisions by 0
@@ -33,7 +33,7 @@ _LEFT = torch.tensor(
 )
 
 
-def runge_kutta_substep(physics: Physics) -> Tensor:
+def runge_kutta_substep(physics: BatchPhysics) -> Tensor:
     """Advance by one substep; all outputs, those of sensors included, are of the fourth stage.
 
     Args:
@@ -105,7 +105,7 @@ class _Root:
         angular.addcmul_(factor, torch.linalg.cross(self._rotation, once))
 
 
-def _reset_failed(physics: Physics) -> Tensor:
+def _reset_failed(physics: BatchPhysics) -> Tensor:
     """Reset failed simulations: with a warning of MuJoCo, or not finite or huge numbers."""
     largest = torch.maximum(physics.qpos.abs().amax(-1), physics.qvel.abs().amax(-1))
     failed = physics.failed() | ~(largest < mujoco.mjMAXVAL)  # also where it is not a number

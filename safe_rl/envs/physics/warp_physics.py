@@ -100,7 +100,6 @@ class WarpPhysics(Physics):
             setattr(self, name, shared[name])
         sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
         self.memory = {name: shared[name] for name in MEMORY if sizes[name]}
-        self.outputs = {name: shared[name] for name in OUTPUTS}
         initial = [name for name in (*STATE, *MEMORY) if shared[name].numel()]
         flat = {name: shared[name].view(num_envs, -1) for name in initial}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
@@ -108,7 +107,6 @@ class WarpPhysics(Physics):
         self._saved: dict[str, Any] = {
             name: wp.empty_like(self._rows[name]) for name in _INTEGRATED if name in flat
         }
-        self._sensors: Any = wp.zeros_like(data.sensordata)
         whole: dict[str, Any] = {"dtype": torch.int32, "device": self.device}
         self._counts = torch.zeros(num_envs, **whole)
         self._overflow = torch.zeros(2, **whole)
@@ -120,7 +118,7 @@ class WarpPhysics(Physics):
         self._mask.fill_(True)
         with self._launching():
             self._substeps(1, None, True)
-            self._forward(True)
+            self._forward()
             self._reset(self._mask)
         # all objects were at one place here, so there were too many contacts
         self._overflow.zero_()
@@ -131,16 +129,15 @@ class WarpPhysics(Physics):
         self._mask.copy_(mask)
         self._run("reset", self._reset, self._mask)
 
-    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
+    def forward(self, mask: Tensor | None = None) -> None:
         """Compute the outputs of all simulations from the state, see `Physics`."""
-        self._run(("forward", sensors), self._forward, sensors)
+        self._run("forward", self._forward)
         self._check_rooms()
 
     def step(
         self,
         num_substeps: int,
         mocap_path: Tensor | None = None,
-        refresh: bool = True,
         counts: Tensor | None = None,
     ) -> Tensor:
         """Advance by substeps and compute the outputs, see `Physics`."""
@@ -154,13 +151,9 @@ class WarpPhysics(Physics):
             if num_substeps not in self._paths:
                 self._paths[num_substeps] = torch.empty_like(columns, dtype=self.dtype)
             path = self._paths[num_substeps].copy_(columns)
-        key = ("step", num_substeps, path is None, refresh, counts is None)
-        self._run(key, self._step, num_substeps, path, refresh, counts is not None)
+        key = ("step", num_substeps, path is None, counts is None)
+        self._run(key, self._step, num_substeps, path, counts is not None)
         self._check_rooms()
-        return self.failed()
-
-    def failed(self) -> Tensor:
-        """Return the simulations that failed since the last call, bool [N]."""
         failed = self._failed.clone()
         self._failed.zero_()
         return failed
@@ -228,7 +221,7 @@ class WarpPhysics(Physics):
         with self._launching():
             wp.capture_launch(self._graphs[key])
 
-    def _step(self, num_substeps: int, path: Tensor | None, refresh: bool, differ: bool) -> None:
+    def _step(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
         self._substeps(num_substeps, path, differ)
         failed = [wp.from_torch(self._failed)]
         for name in ("qpos", "qvel", "qacc_warmstart"):
@@ -236,8 +229,7 @@ class WarpPhysics(Physics):
                 row = self._rows[name]
                 wp.launch(find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
         self._reset(self._failed)
-        if refresh:
-            self._forward(True)
+        self._forward()
 
     def _substeps(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
         counts = wp.from_torch(self._counts)
@@ -254,14 +246,9 @@ class WarpPhysics(Physics):
                     live = self._rows[name]
                     wp.launch(restore_rows, live.shape, [counts, substep, saved], [live])
 
-    def _forward(self, sensors: bool) -> None:
+    def _forward(self) -> None:
         data = self._data
-        if sensors:
-            mjw.forward(self._model, data)
-        else:
-            wp.copy(self._sensors, data.sensordata)
-            mjw.forward(self._silent, data)
-            wp.copy(data.sensordata, self._sensors)
+        mjw.forward(self._model, data)
         lost = [data.overflow, _LOST_CONTACTS, _LOST_ROWS]
         wp.launch(
             note_overflow,

@@ -66,6 +66,7 @@ class VelocityEnv(SimulatedEnv):
     """
 
     first_camera: ClassVar = "track"
+    _physics: BatchPhysics
 
     def __init__(
         self,
