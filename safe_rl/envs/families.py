@@ -79,6 +79,7 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
         if not values.hold(full[key]):
             raise ConfigError(f"'{key}' must be {values.words}, got {full[key]!r}.")
     family.check(full)
+    parse_ranges(full.get("outside"))
     if None in (full["cost_keys"], full["num_steps"]):
         # Imported here, because environments need torch and their names do not.
         module, _, function = family.describe.partition(":")
@@ -101,7 +102,6 @@ def _check_gymnasium(node: Mapping[str, Any]) -> None:
             f"env.id={node['id']}: a configuration cannot import a module. If you trust "
             f"'{module}', use import={module} env.id={plain}"
         )
-    parse_ranges(node.get("outside"))
 
 
 def _check_torchrl(node: Mapping[str, Any]) -> None:
@@ -113,7 +113,6 @@ def _check_torchrl(node: Mapping[str, Any]) -> None:
             "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
             "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
         )
-    parse_ranges(node["outside"])
 
 
 _Names, _Arguments = list[Text] | None, Mapping[str, Any] | None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import math
 from typing import Any
 
 import mujoco
@@ -82,4 +83,4 @@ def most_contacts(config: SafetyGymConfig, env_class: Any) -> tuple[int, int]:
 
 def _power_of_two(number: float) -> int:
     """Round up to a power of two, because kernels are compiled once for each size."""
-    return 1 << (max(1, int(number)) - 1).bit_length()
+    return 1 << (math.ceil(number) - 1).bit_length()

@@ -36,11 +36,11 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self.max_episode_steps = base_env.max_episode_steps
         self.seconds_per_step = base_env.seconds_per_step
         self.events = base_env.events
-        self._named = dict(transforms)
+        self._ours = {n: t for n, t in transforms.items() if isinstance(t, ConstraintTransform)}
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
         layout = dict(base_env.observation_layout)
-        for name, transform in self._ours().items():
+        for name, transform in self._ours.items():
             try:
                 transform.check(self.cost_keys)
                 layout = transform.extend_layout(layout)
@@ -52,9 +52,6 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self.observation_layout = layout
         self._seed_transforms(seed)
 
-    def _ours(self) -> dict[str, ConstraintTransform]:
-        return {n: t for n, t in self._named.items() if isinstance(t, ConstraintTransform)}
-
     @property
     def render(self) -> Any:
         """The inner environment's method that draws it; None if it draws no pictures."""
@@ -63,7 +60,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     @property
     def steps_per_decision(self) -> int:
         """Steps of the environment that one call of `step` takes."""
-        own = (transform.steps_per_decision for transform in self._ours().values())
+        own = (transform.steps_per_decision for transform in self._ours.values())
         return math.prod(own, start=self.base_env.steps_per_decision)
 
     def highest_cost(self, key: str) -> float:
@@ -72,7 +69,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         known = key in self.base_env.cost_keys
         highest = self.base_env.highest_cost(key) if known else super().highest_cost(key)
         of_a_step = super().highest_cost(key) / self.max_episode_steps
-        for transform in self._ours().values():
+        for transform in self._ours.values():
             highest = transform.highest_cost(key, highest, of_a_step)
         return highest
 
@@ -89,7 +86,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         if seed is None:
             return
         rows = rng.row_seeds(seed, self.batch_size.numel())
-        for number, transform in enumerate(self._ours().values(), 1):
+        for number, transform in enumerate(self._ours.values(), 1):
             # negative numbers, because environments fold with the number of the episode
             transform.seed(rng.fold(rows, -number))
 
@@ -101,7 +98,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         """Continue schedules after this number of steps per row, from the next reset on."""
         self.steps_before = steps
         self.base_env.continue_from(steps)
-        for transform in self._ours().values():
+        for transform in self._ours.values():
             transform.continue_from(steps)
 
     def get_state(self) -> TensorDictBase | None:
@@ -110,23 +107,21 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         None if the inner environment or one of the transforms cannot be stored; also if
         `append_transform` or `insert_transform` has added one.
         """
-        ours = self._ours().values()
-        stores = all(any(t is one for one in ours) for t in self.transform.transforms)
+        stores = all(t in self._ours.values() for t in self.transform.transforms)
         state = self.base_env.get_state() if stores else None
         if state is None:
             return None
-        for name, transform in self._ours().items():
+        for name, transform in self._ours.items():
             if rows := transform.rows():
                 state.set((_STATE, name), TensorDict(rows, batch_size=self.batch_size))
         return state
 
     def set_state(self, state: TensorDictBase) -> TensorDictBase:
         """Set a state; a transform that is missing in it starts an episode."""
-        ours = self._ours()
         # the inner environment may have transforms, too
-        inside = state.exclude(*((_STATE, name) for name in ours)).filter_empty_()
+        inside = state.exclude(*((_STATE, name) for name in self._ours)).filter_empty_()
         reset = self.base_env.set_state(inside)
-        for name, transform in ours.items():
+        for name, transform in self._ours.items():
             rows = state.get((_STATE, name), None)
             if rows is not None:
                 transform.put_rows(dict(rows.items()))
