@@ -118,8 +118,8 @@ class VelocityConfig:
     """Everything that defines one environment; keys that its robot does not have are None.
 
     Except `robot`, `velocity_threshold`, `num_steps` and the scales of the dynamics, the keys are
-    those of Gymnasium's environments of version 5 (Towers et al. 2024). `from_dict` adds the
-    robot's defaults.
+    those of Gymnasium's environments of version 5 (Towers et al. 2024). Use `from_dict`, which adds
+    the robot's defaults.
 
     Raises:
         ConfigError: If a value has the wrong type or is out of range.
@@ -132,22 +132,22 @@ class VelocityConfig:
 
     robot: str
     velocity_threshold: NotNegative  # m/s; faster costs 1
-    num_steps: Count = 1000  # of an episode
+    num_steps: Count  # of an episode
     frame_skip: Count  # substeps per step
     # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
-    mass_scale: Positive = 1.0
-    friction_scale: Positive = 1.0
-    damping_scale: NotNegative = 1.0  # of joints
-    strength_scale: NotNegative = 1.0  # of actuators
+    mass_scale: Positive
+    friction_scale: Positive
+    damping_scale: NotNegative  # of joints
+    strength_scale: NotNegative  # of actuators
     reset_noise_scale: NotNegative  # of positions [m, rad] and velocities [m/s, rad/s]
-    exclude_current_positions_from_observation: bool = True
+    exclude_current_positions_from_observation: bool
     include_cinert_in_observation: bool | None = None
     include_cvel_in_observation: bool | None = None
     include_qfrc_actuator_in_observation: bool | None = None
     include_cfrc_ext_in_observation: bool | None = None
 
     # reward
-    forward_reward_weight: Number = 1.0  # per m/s
+    forward_reward_weight: Number  # per m/s
     ctrl_cost_weight: Number  # per squared control
     contact_cost_weight: Number | None = None  # per squared force [N², N²m²]
     contact_cost_range: Interval | None = None  # of the weighted sum
