@@ -23,10 +23,10 @@ class ConstrainedEnv(EnvBase):
     """A batch of N environments that are stepped together: an `EnvBase` of batch size [N].
 
     It reads `action`: bounded numbers [N, A], or choices as integers [N] or [N, A], or as one-hot
-    vectors [N, C]. A policy may draw continuous actions outside the bounds (at first they are about
-    -1 to 1); the environment clips them. It writes `observation` (vectors of float32, or pictures),
-    `reward` [N, 1], each of `cost_keys` [N, 1] (0 or more), `done`, `terminated` and `truncated`.
-    The costs are part of the reward spec.
+    vectors [N, C]. A policy may draw continuous actions outside the bounds; the environment clips
+    them. (An untrained policy draws from about -1 to 1.) It writes `observation` (vectors of
+    float32, or pictures), `reward` [N, 1], each of `cost_keys` [N, 1] (0 or more), `done`,
+    `terminated` and `truncated`. The costs are part of the reward spec.
 
     Attributes:
         cost_keys: Names of the costs; the aggregate `cost` is one of them. It has no default.
@@ -40,8 +40,8 @@ class ConstrainedEnv(EnvBase):
         steps_per_decision: Environment steps that one call of `step` takes. If it is not 1, each
             call writes their number to `steps_taken` [N, 1]: it is lower where an episode ends.
         steps_before: Steps of every row in earlier parts of the run.
-        first_steps: Steps [N] after which the episodes of the next reset begin; None (the default)
-            is 0. It needs a state with `step_count`.
+        first_steps: Numbers of steps [N] that the episodes of the next reset count as taken; None
+            (the default) is 0. Only for environments whose state has `step_count`.
         render: Method that draws pictures as `SimulatedEnv.render` does; None if there is none.
 
     Examples:
@@ -111,7 +111,8 @@ class ConstrainedEnv(EnvBase):
     def any_done(self, tensordict: TensorDictBase) -> bool:
         """Return whether any episode has ended, and write to `_reset` which ones.
 
-        TorchRL's method returns a tensor, so that the host would wait for the device twice.
+        TorchRL's method returns a tensor. The host would wait for the device to compute it, and
+        again to read it.
         """
         done = tensordict.get("done")
         if has_ended := bool(done.any()):
@@ -132,7 +133,7 @@ class ConstrainedEnv(EnvBase):
             ) from error
 
     def continue_from(self, steps: int) -> None:
-        """Continue schedules after a number of steps of every row."""
+        """Continue schedules after this number of steps per row in earlier parts of the run."""
         self.steps_before = steps
 
 

@@ -10,7 +10,7 @@ class ConfigError(ValueError):
 
 
 def on_cpu_only(key: str) -> str:
-    """Return a hint that only Safety Gym has a key of MuJoCo Warp; an empty text for other keys."""
+    """Return a hint for MuJoCo Warp's keys, which only Safety Gym has; else an empty text."""
     if key not in ("physics", "physics_buffers"):
         return ""
     return (
@@ -27,7 +27,7 @@ def require_integer(name: str, value: Any, lowest: int) -> None:
 
 
 def require_all_rows(stepped: Any) -> None:
-    """Raise NotImplementedError if some rows of a batch, not all, are to step: None or bool [N]."""
+    """Raise NotImplementedError if only some rows are to step: bool [N], or None for all rows."""
     if stepped is not None and not stepped.all():
         raise NotImplementedError(
             "A transform of TorchRL, such as ConditionalSkip or MultiAction, asks for a step of "

@@ -242,7 +242,7 @@ def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
 
 
 def _keys_of(element: Element) -> dict[str, Key]:
-    """Return the keys that an element gets without being asked, see `register_element`."""
+    """Return the keys that `register_element` adds by itself."""
     keys = {
         "placements": Key(None, Placements),
         "locations": Key((), Locations),

@@ -59,7 +59,9 @@ class ForeignFamily:
 
 
 def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a node with all keys; cost keys and length of episodes are determined if None.
+    """Return a node with all keys.
+
+    If its cost keys or the length of its episodes are None, they are read from an environment.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.

@@ -47,7 +47,7 @@ def make_env(
         seed: Determines every random draw; None takes a seed from torch's generator.
         num_threads: Largest number of threads that step them; 0 for one per core.
         transforms: Name -> transform, or its node, as `transform_env` takes them.
-        evaluating: Whether transforms that only serve learning are undone.
+        evaluating: Whether policies are evaluated; transforms that only help learning are then off.
 
     Raises:
         ConfigError: For an unknown name or key, or a value that cannot be used.

@@ -117,9 +117,9 @@ class Physics(ABC):
         return mask.new_ones(len(mask)).cumsum(0) - 1 if self.waits else mask.nonzero()[:, 0]
 
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Raise an error if `wrong` (bool) is True anywhere, on a device possibly in a later call.
+        """Raise an error if `wrong` (bool) is True anywhere.
 
-        `error` makes the error, and may read tensors.
+        On an accelerator, a later call may raise it. `error` makes the error, and may read tensors.
         """
         if wrong.any():
             raise error()

@@ -61,7 +61,7 @@ class BatchPhysics(Physics):
         self._process = os.getpid() if has_threads else None
         self.timestep = float(model.opt.timestep)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
-        # All fields are bound before the first call, because later ones would start as zero.
+        # All fields are bound before the first call: a field that is bound later starts as zero.
         for name in STATE:
             setattr(self, name, _share(self._batch.bind(name)))
         memory = [name for name, size in (("act", model.na), ("history", model.nhistory)) if size]

@@ -269,7 +269,7 @@ def _align_capsules(model: Any, data: Any) -> None:
 
 
 class _LateChecks:
-    """Conditions on a device that the host reads once it need not wait for them."""
+    """Conditions on a device. The host reads each one when it has arrived, and never waits."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

@@ -68,7 +68,7 @@ def add_targets(
 
 
 def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
-    """Whether an area has a shape; the goal of a button task has none, as the button has one."""
+    """Whether an area has a shape; the goal of a button task has none, but its button has."""
     stands_in = element.kind == "goal" and goal_is_button(config.task)
     return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 

@@ -20,24 +20,24 @@ from safe_rl.envs.safety_gym.world import World
 
 
 def hazard_cost(robot_xy: Tensor, hazard_xy: Tensor, size: float) -> Tensor:
-    """Depth [m] of the robot [N, 2] in hazards [N, K, 2] of radius `size`, summed: [N]."""
+    """Sum of the depths [m] of the robot [N, 2] in hazards [N, K, 2] of radius `size`: [N]."""
     distance = torch.hypot(*(hazard_xy - robot_xy.unsqueeze(-2)).unbind(-1))
     return torch.rsub(distance, size).relu_().sum(-1)
 
 
 def contact_cost(contacts: Tensor) -> Tensor:
-    """Contact points of the robot with K objects, summed: [N, K] -> [N]."""
+    """Number of contact points of the robot with all K objects: [N, K] -> [N]."""
     return contacts.sum(-1)
 
 
 def displacement_cost(xy: Tensor, start_xy: Tensor, threshold: float) -> Tensor:
-    """Distance [m] of objects [N, K, 2] from their start, where above the threshold, summed."""
+    """Sum of those distances [m] of objects [N, K, 2] from their start that exceed a threshold."""
     moved = torch.hypot(*(xy - start_xy).unbind(-1))
     return torch.where(moved > threshold, moved, 0.0).sum(-1)
 
 
 def velocity_cost(velocity: Tensor, threshold: float) -> Tensor:
-    """Speed [m/s] of objects, where at least the threshold, summed: [N, K, 3] -> [N]."""
+    """Sum of those speeds [m/s] of objects that are at least the threshold: [N, K, 3] -> [N]."""
     speed = torch.linalg.vector_norm(velocity, dim=-1)
     return torch.where(speed >= threshold, speed, 0.0).sum(-1)
 

@@ -149,7 +149,10 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
 
 
 def _current(world: World) -> Tensor:
-    """Return present positions as a layout [N, 1 + M, 2]; gremlins have those of the start."""
+    """Return present positions as a layout [N, 1 + M, 2].
+
+    Guided objects, such as gremlins, have their positions at the start of the episode.
+    """
     current = torch.cat([world.robot_pos[:, None, :2], world.positions[..., :2]], 1)
     guided = world.scene.guided
     columns = slice(1 + guided.start, 1 + guided.stop)

@@ -219,7 +219,10 @@ class SafetyGymEnv(SimulatedEnv):
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Draw new goals where met; return these worlds, and those without a place, if drawn."""
+        """Draw new goals in the worlds that meet their goals; return these worlds, bool [N].
+
+        Also return the worlds without a place for a new goal; None if no goals were drawn.
+        """
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None

@@ -140,7 +140,7 @@ def _stack(rectangles: Sequence[list[_Rectangle]]) -> tuple[Tensor, Tensor]:
 TRIES_PER_OBJECT = 100
 TRIES_PER_LAYOUT = 10_000
 TRIES_PER_GOAL = 10_000
-# Always this many tries if the host does not read results; they nearly always suffice.
+# If the host does not read results, it always tries this often; that nearly always suffices.
 TRIES_UNSEEN = 200
 _BLOCK = 10  # candidates for an object that are tested at once
 _GOAL_BLOCK = 40  # the same for a new goal; they mostly suffice without a second round

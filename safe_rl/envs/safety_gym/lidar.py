@@ -32,16 +32,17 @@ def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
 
 
 def _num_laps(num_bins: int) -> int:
-    """Return the turns of the circle in the array of readings, so that bin indices do not wrap."""
+    """Return how often the circle is repeated in a lidar's cells, so that no bin lies outside."""
     return 2 if num_bins > 2 else 4
 
 
 def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) -> Tensor:
-    """Return the cells of objects straight ahead, in one array for all lidars of all robots.
+    """Return the cells of the first bins, in one array for all lidars of all robots.
 
-    `group`, int64 [M], is the lidar (of G) that sees each object. The result, int64 [3, N, M], has
-    the cell of the bin before the object's own, of its own, and of the one after. Cells are ordered
-    by robot, then by lidar; each lidar has several turns of the circle.
+    `group`, int64 [M], is the lidar (of G) that sees each object. The result, int64 [3, N, M], is
+    for an object in the first bin of its lidar: it has the cell of the bin before that one, of the
+    bin itself, and of the one after. Cells are ordered by robot, then by lidar; each lidar has
+    several turns of the circle.
     """
     laps = _num_laps(num_bins)
     robot = torch.arange(num_robots, device=group.device).unsqueeze(1)

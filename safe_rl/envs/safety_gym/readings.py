@@ -59,7 +59,7 @@ def _freejoint_size(config: SafetyGymConfig, scene: Scene) -> int:
 def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
     """Return a planar robot's coordinates in the frame of its start; others are unchanged.
 
-    Only if `moved`, the start's position is subtracted; velocities are only rotated.
+    With `moved`, the pose of the start is subtracted first. Velocities are only rotated.
     """
     if not world.scene.planar:
         return vector

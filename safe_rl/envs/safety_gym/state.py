@@ -115,8 +115,8 @@ def place_mocaps(world: World) -> None:
         span = slice(scene.num_free, scene.num_free + scene.num_mocap_slots)
         physics.mocap_pos[:, scene.num_targets :] = world.positions[:, span]
     if scene.num_targets:
-        # Before the last substep they were here, and the state was computed from that; at the
-        # start they are at the positions of their objects.
+        # The state was computed with the positions that the targets had in the last substep, which
+        # began one timestep ago. At the start they are at the positions of their objects.
         last = (physics.time - physics.timestep).clamp(min=0.0)
         targets = gremlin_path(world, last, 1)[:, 0, : scene.num_targets]
         centres = world.layout[:, 1 + scene.guided.start : 1 + scene.guided.stop]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from safe_rl.envs.safety_gym.world import World
 
 
-_CENTRE = 1e-12  # [m]
+_CENTRE = 1e-12  # smallest radius, against a division by 0 [m]
 
 
 def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:

@@ -177,7 +177,7 @@ class ActionRepeat(ConstraintTransform):
         self.steps_per_decision = k
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return that no step was taken."""
+        """Return 0 as the number of steps that were taken."""
         beside = getattr(self.container.transform, "transforms", ())
         others = [t for t in beside if isinstance(t, ConstraintTransform) and t is not self]
         if others:

@@ -65,7 +65,10 @@ class ConstraintTransform(Checked, Transform):
         check_known(self.needed_costs, cost_keys)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
-        """Return the highest possible cost of an episode, given the one without the transform."""
+        """Return the highest possible cost of an episode.
+
+        `highest` is the one without the transform, and `of_a_step` the highest cost of a step.
+        """
         return highest
 
     def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:

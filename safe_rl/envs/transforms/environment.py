@@ -22,7 +22,7 @@ _STATE = "transforms"
 class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     """N environments with transforms, made by `transform_env`.
 
-    What transforms do not change is read from the inner environment.
+    Everything that no transform changes is read from the inner environment.
 
     Attributes:
         cost_keys: Costs of the inner environment, then those of the transforms.
@@ -91,7 +91,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             transform.seed(rng.fold(rows, -number))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # TorchRL keeps entries of an earlier step that `base_env` does not write again
+        # TorchRL would keep this entry of the last step, because `base_env` does not write it
         return super()._step(tensordict.exclude(("next", self.return_key)))
 
     def continue_from(self, steps: int) -> None:
@@ -172,7 +172,7 @@ def transform_env(
             transform.evaluating = evaluating
     repeating = _repeating(made)
     if repeating and len(made) > 1:
-        # an inner environment with all others, of which the last transform takes several steps
+        # The last transform takes several steps of an inner environment, which has all the others.
         last = {repeating: made.pop(repeating)}
         return TransformedConstrainedEnv(TransformedConstrainedEnv(env, made, seed), last, seed)
     return TransformedConstrainedEnv(env, made, seed)

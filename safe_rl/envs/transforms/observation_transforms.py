@@ -100,7 +100,11 @@ class SensorNoise(ConstraintTransform):
         return self._components is None or name in self._components
 
     def _with_noise(self, value: Tensor, first: int, *, whole: bool = False) -> Tensor:
-        """Add noise, counting columns of the draws from `first`; integers stay unchanged."""
+        """Add noise; integers stay unchanged.
+
+        The columns of the draws are numbered from `first`. Only the named components get noise,
+        unless the `whole` value is one of them.
+        """
         if not value.dtype.is_floating_point:
             return value
         key, step = self._rows["key"], self._rows["step"]
@@ -178,9 +182,10 @@ class ObservedCosts(ConstraintTransform):
     """Add the costs of the last step, and a trace of earlier costs, to the observation.
 
     Costs may have causes that no sensor shows: a vase that was touched costs as long as it moves.
-    The published observation does not contain the costs, and a deployed policy needs them too:
-    mention this beside every result. The trace e of a cost c is e ← decay · e + (1 − decay) · c,
-    a mean over about the last 1 / (1 − decay) steps. Both are 0 when an episode begins.
+    The published observation does not contain the costs, and a policy needs them also when it is
+    deployed. So mention this transform beside every result. The trace e of a cost c is
+    e ← decay · e + (1 − decay) · c, a mean over about the last 1 / (1 − decay) steps. Both are 0
+    when an episode begins.
 
     Args:
         decay: Weight of the past in the trace.

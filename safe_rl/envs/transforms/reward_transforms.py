@@ -30,7 +30,7 @@ class _ChangesReward(ConstraintTransform):
     return_key = "task_reward"
 
     def _keep_reward(self, step: TensorDictBase) -> Tensor:
-        """Return the reward, and copy it to `return_key`, unless an earlier transform has."""
+        """Return the reward; copy it to `return_key`, unless an earlier transform has done so."""
         reward = step.get("reward")
         step.set(self.return_key, step.get(self.return_key, reward))
         return reward
@@ -79,7 +79,8 @@ class EarlyTermination(ConstraintTransform):
     In evaluation, episodes continue, as in the paper, so that the cost of the whole episode counts.
 
     Args:
-        budgets: Cost key -> undiscounted cost per episode; at exactly this cost, it continues.
+        budgets: Cost key -> undiscounted cost per episode; an episode of exactly this
+            cost continues.
         in_evaluation: Whether episodes of an evaluation terminate, too. Then none costs more than
             the budget plus the cost of one step.
 
@@ -102,7 +103,7 @@ class EarlyTermination(ConstraintTransform):
         return min(highest, self._budgets[key] + of_a_step) if ends else highest
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
-        """Return that nothing is spent."""
+        """Return costs of 0."""
         return {"spent": done.new_zeros(*done.shape[:-1], len(self._budgets), dtype=torch.float64)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -114,7 +115,7 @@ class EarlyTermination(ConstraintTransform):
         over = (spent > allowed).any(-1, keepdim=True)
         for key in ("done", "terminated"):
             next_tensordict.set(key, next_tensordict.get(key) | over)
-        # algorithms do not agree on ends that are both
+        # an end is never both, because algorithms do not agree on what both would mean
         next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
         return next_tensordict
 

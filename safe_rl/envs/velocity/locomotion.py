@@ -21,10 +21,15 @@ FORCES = "cfrc_ext"
 
 
 class Place(NamedTuple):
-    """The point whose velocity is limited: the outputs it needs, and how it is read [N, D] (m).
+    """The point whose velocity is limited.
 
     `torso` and `centre_of_mass` are read as `mj_step` leaves them: they belong to the last state
-    that it evaluated. D is 1 for a limit on the velocity along x, 2 for one on the planar speed.
+    that it evaluated.
+
+    Attributes:
+        outputs: Outputs of the physics that it needs.
+        reading: Returns a function that reads its position [N, D] (m). D is 1 for a limit on the
+            velocity along x, and 2 for one on the planar speed.
     """
 
     outputs: tuple[str, ...]
@@ -54,7 +59,7 @@ PLACES: Mapping[str, Place] = {
 def limited_speed(velocity: Tensor) -> Tensor:
     """Return the limited speed, the x velocity or the planar speed: [N, D] -> [N].
 
-    As in Safety-Gymnasium, the x velocity is signed, so moving backwards costs nothing there.
+    As in Safety-Gymnasium, the x velocity is signed, so moving backwards costs nothing with it.
     """
     return velocity[:, 0] if velocity.shape[-1] == 1 else velocity.square().sum(-1).sqrt()
 

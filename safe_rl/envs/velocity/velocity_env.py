@@ -104,7 +104,7 @@ class VelocityEnv(SimulatedEnv):
         self._step_count[rows] = 0
 
     def _start(self, rows: Tensor) -> None:
-        """Write place and observation of rows, int64 [R], whose state no step has reached."""
+        """Write place and observation of rows, int64 [R], whose state was set, not stepped to."""
         self._last_place[rows] = self._place()[rows]
         self._observer.write_start(self._physics, self._observation, rows)
 
@@ -188,6 +188,7 @@ class Starts:
         """
         known = torch.equal(self._episodes[rows], episodes[rows])
         if not (known and torch.equal(self._seeds, seeds)):
+            # the next episodes of the rows that go on are drawn too
             self._seeds, self._episodes = seeds.clone(), episodes + 1
             self._episodes[rows] = episodes[rows]
             key = rng.fold(self._seeds, self._episodes)
