@@ -101,8 +101,6 @@ allowed = cache(values_of)
 
 def coerce(name: str, key: Key, value: Any) -> Any:
     """Return a value as the type of its key; ConfigError if the type or range is wrong."""
-    if isinstance(key.annotation, str):
-        raise ConfigError(f"The type of key '{name}' must be a type, not {key.annotation!r}.")
     values, plain = allowed(key.annotation), _plain(value)
     if not values.hold(plain):
         raise ConfigError(f"Configuration key '{name}' must be {values.words}, got {value!r}.")
