@@ -39,7 +39,7 @@ class RefuseLooks(TorchDispatchMode):
 
 @contextmanager
 def no_looks(physics, monkeypatch):
-    """Nothing looks at values, copies to the host or makes tensors on no particular device."""
+    """Fail if a value is read, copied to the host, or made without naming its device."""
 
     def refuse(name):
         original = getattr(torch.Tensor, name)
@@ -53,6 +53,6 @@ def no_looks(physics, monkeypatch):
     with monkeypatch.context() as monkeypatch:
         for name in ("numpy", "cpu", "item", "tolist", "__array__"):
             refuse(name)
-        # what is made without a device then has no values, and cannot be computed with
+        # a tensor that is made without a device has no values here, so computing with it fails
         with RefuseLooks(physics) as mode, torch.device("meta"):
             yield mode

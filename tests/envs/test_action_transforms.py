@@ -43,7 +43,7 @@ def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_f
     env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"f": node, "s": RewardScale(0.5)})
     state = env.reset()
     for _ in range(3):
-        # "robot" is the body's place, which the joints of a planar robot are
+        # the joints of a planar robot are the position of its body
         xy = env.get_state()["qpos"][:, :2]
         state["action"] = torch.ones(2, 2)
         state = env.step(state)["next"].exclude("reward")

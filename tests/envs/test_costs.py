@@ -16,7 +16,7 @@ MAGNITUDES = {
     "placements_extents": [-6, -6, 6, 6],
     **{f"constrain_{kind}": True for kind in ALL_KINDS},
 }
-# No substeps: a step judges the state that it starts from.
+# Without substeps, a step computes the costs and rewards of the state that it starts from.
 FROZEN = {**MAGNITUDES, "task": "none", "frameskip_binom_p": 0.0}
 
 

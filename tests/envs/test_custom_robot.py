@@ -1,4 +1,4 @@
-"""Robots by the path of an MJCF file: what works, and what an unusable file is told."""
+"""Robots by the path of an MJCF file: what works, and the errors for files that do not."""
 
 import copy
 import math

@@ -14,8 +14,8 @@ from playing import assert_same, play
 from safe_rl.envs import SUITE, SafetyGymEnv
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
-# Short episodes and large goals, so that resets and new goals are among the compared steps; of
-# some rows alone where a goal ends the episode.
+# Short episodes and large goals, so that the compared steps include resets and new goals. Where a
+# goal ends the episode, single rows are reset.
 BUSY = {"num_steps": 20}
 CONFIGS = {
     "goal": SUITE["PointGoal2"].replace(
@@ -25,7 +25,7 @@ CONFIGS = {
     "push": SUITE["DoggoPush2"].replace(**BUSY, goal_size=1.0),
     "noise": SUITE["PointPush1"].replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),
 }
-# Met goals are rare with random actions, but for these tasks.
+# With random actions, goals are often met only in these.
 MEETS_GOALS = ("goal", "push")
 NAMES = [*CONFIGS, *VELOCITY_SUITE]
 CONFIGS["nested"] = SUITE["CarGoal1"].replace(**BUSY, observation_flatten=False, layout_seeds=3)

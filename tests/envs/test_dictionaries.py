@@ -51,5 +51,5 @@ def test_the_goal_of_tasks_without_one_is_the_origin(task):
     near = math.exp(-0.5)
     assert seen[layout["goal_dist"]].item() == pytest.approx(near)
     assert seen[layout["goal_compass"]].tolist() == pytest.approx([-0.6, 0.8], abs=2e-3)
-    # to the left and back: 126.9 degrees of 36 each
+    # to the left and behind, at 126.9 degrees: in the fourth bin of 36 degrees
     assert seen[layout["goal_lidar"]].tolist() == pytest.approx([0, 0, 0, near] + [0] * 6)

@@ -49,7 +49,7 @@ MADE = [
 @pytest.mark.parametrize(("name", "keys"), MADE)
 def test_a_failing_world_ends_and_leaves_the_others_alone(name, keys, fault):
     env, sane = make(name, **keys), make(name, **keys)
-    # The row that is all right in the comparison has its state set all the same.
+    # In the comparison, the state of this row is set too, but to one that does not fail.
     got = step_with(env, **FAULTS[fault])
     want = step_with(sane, **({"velocity": 0.0} if "velocity" in FAULTS[fault] else {}))
     assert got["reward"][BROKEN] == keys.get("reward_exception", 0.0)

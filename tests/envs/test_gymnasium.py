@@ -1,4 +1,4 @@
-"""Gymnasium's interfaces: by its own checkers and vectors, and beside the batched environment."""
+"""Gymnasium's interfaces, against its checkers and vectors, and against the batched environment."""
 
 import warnings
 

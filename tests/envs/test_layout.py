@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from safe_rl.envs import SUITE, LayoutError, SafetyGymEnv
 
 NUM_LAYOUTS = 800
-# No substeps: a step judges the state that it starts from.
+# Without substeps, a step computes the costs and rewards of the state that it starts from.
 FROZEN = {"frameskip_binom_p": 0.0}
 POINT = {"robot_base": "point", "task": "none"}
 UNLIKELY = 1e-3  # p values below this one would be a finding
@@ -104,7 +104,7 @@ def by_rejection(rng, keepouts: list[float], half: float) -> np.ndarray | None:
 
 
 def by_the_rule(rng, keepouts: dict[str, float], half: float, number: int) -> dict:
-    """Many layouts, started over where something did not fit, and their first goals drawn anew."""
+    """Many layouts, drawn again where something does not fit; then the first goals, once more."""
     layouts: list[np.ndarray] = []
     names, sizes = list(keepouts), list(keepouts.values())
     goal, mine = names.index("goal"), keepouts["goal"]
@@ -147,7 +147,7 @@ def test_first_goals_are_drawn_beside_everything_that_stands():
 
 
 def test_a_goal_without_a_second_place_keeps_its_first():
-    """Nothing but one point, which the pinned goal is drawn at again, up to its tolerance."""
+    """The pinned goal can only be drawn at its point again, up to the tolerance."""
     pins = {"robot_locations": [[0, 0]], "goal_locations": [[0.8, 0]], "goal_keepout": 0.4}
     got = fresh_places({"robot_base": "point", "task": "goal", **pins}, 20)["goal"]
     np.testing.assert_allclose(got, [[0.8, 0.0]] * 20, atol=1e-9)

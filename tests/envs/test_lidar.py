@@ -65,7 +65,7 @@ def test_observations_do_not_know_where_the_origin_is(env_name):
 
 
 def one_by_one(x: float, y: float, num_bins: int) -> np.ndarray:
-    """What one object 1 m from zero lights up in a lidar with aliasing, by the paper's words."""
+    """Readings of a lidar with aliasing that sees one object, as the paper describes them."""
     turn = (math.atan2(y, x) % (2 * math.pi)) / (2 * math.pi) * num_bins
     own = min(int(turn), num_bins - 1)
     reading, part = math.exp(-math.hypot(x, y)), turn - own

@@ -39,7 +39,7 @@ def test_new_goals_are_uniform_where_they_fit():
     want = candidates[clear]
     for measure in (lambda xy: xy[:, 0], lambda xy: xy[:, 1], lambda xy: np.hypot(*xy[:, :2].T)):
         assert stats.ks_2samp(measure(got), measure(want)).pvalue > UNLIKELY
-    # One goal after the other says nothing about the next.
+    # A goal does not tell where the next one is.
     assert stats.spearmanr(goals[0][:, 0], goals[1][:, 0]).pvalue > UNLIKELY
 
 
@@ -53,7 +53,7 @@ MOVED = {
 
 @pytest.mark.parametrize("name", MOVED)
 def test_new_goals_keep_clear_of_where_things_have_moved(name):
-    """And of the place of a gremlin's circle, wherever it is on it."""
+    """A gremlin's place is the centre of its circle, wherever it is on it."""
     env = make({**ALWAYS_MET, **MOVED[name], "goal_keepout": 0.2}, NUM_ENVS)
     state = env.get_state()
     before = places(env, state)[name].clone()

@@ -79,7 +79,7 @@ def test_noise_comes_from_the_seed_and_rows_do_not_share_it(env):
     made = transformed(env, "noise", seed=3)
     first = still(made, 12)["observation"]
     for seed, same in ((3, True), (4, False)):
-        torch.manual_seed(9)  # nobody's draws but the row's
+        torch.manual_seed(9)  # torch's generator has no influence
         again = transformed(env, "noise", seed=seed)
         assert torch.equal(still(again, 12)["observation"], first) == same
     assert (first[0] != first[1]).any()

@@ -25,7 +25,7 @@ CASES = {
 
 
 class WaitingPhysics(Physics):
-    """A backend that computes in another type, and whose values nobody can look at for nothing."""
+    """A backend of another type of numbers, where the host would wait to read a value."""
 
     device, waits = torch.device("cpu"), True
 
@@ -73,7 +73,7 @@ def waiting(config, dtype=torch.float64, **arguments):
 
 
 def rollouts(*envs, steps, monkeypatch):
-    """Steps of environments under the same actions; a waiting one must not look."""
+    """Steps of environments under the same actions; on `WaitingPhysics` they read no value."""
     states = [env.reset() for env in envs]
     torch.manual_seed(0)
     for _ in range(steps):

@@ -29,7 +29,7 @@ def package(monkeypatch):
 
 
 def rollout(env):
-    """Random actions, of which the type of the spec would otherwise make other numbers."""
+    """Random actions, also beyond the bounds; their draws do not depend on the type of the spec."""
     torch.manual_seed(0)
 
     def act(tensordict):

@@ -1,8 +1,8 @@
 """Letting resting objects sleep makes steps cheap; it must not change what is measured.
 
 Contacts are chaotic, so two runs from one seed soon have nothing in common, and their means differ
-by chance. Here worlds without sleep go along with a run with sleep, set to its state again and
-again: what differs within such a window is the work of sleeping.
+by chance. Here worlds without sleep are set to the state of a run with sleep again and again. What
+differs within such a window is caused by sleeping.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ from safe_rl.envs import SUITE, SafetyGymEnv
 
 MOST_CHAOTIC = 0.4  # share of worlds in which contacts differ
 NUM_ENVS, NUM_WINDOWS, WINDOW = 100, 12, 25
-TELLING, NEGLIGIBLE = 0.05, 0.005  # of what is measured
+TELLING, NEGLIGIBLE = 0.05, 0.005  # largest error and allowed bias, as shares of the measured value
 SOLID = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
 SEEN_BY_RAYS = {
     **{"robot_base": "point", "task": "push", "lidar_type": "natural", "observe_sensors": False},

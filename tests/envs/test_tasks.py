@@ -12,7 +12,7 @@ from safe_rl.envs import EXTRAS, SafetyGymEnv
 from safe_rl.envs.safety_gym.tasks import circle_speed
 
 POINT = {"robot_base": "point", "placements_extents": [-4, -4, 4, 4]}
-# No substeps: a step judges the state that it starts from.
+# Without substeps, a step computes the costs and rewards of the state that it starts from.
 FROZEN = {**POINT, "frameskip_binom_p": 0.0}
 GOAL_HEIGHT = 0.3 / 2 + 0.01
 POINT_HEIGHT = 0.1

@@ -1,4 +1,4 @@
-"""TorchRL's own environments, and somebody's for it, through the ordinary commands."""
+"""Environments of TorchRL, and of users in its interface, through the ordinary commands."""
 
 import json
 from types import SimpleNamespace

@@ -26,7 +26,7 @@ allow("transforming")
 
 
 def rewards_of(env, steps=6):
-    """What a point earns that moves, [N, T, 1] by entry."""
+    """Steps of a point that moves, so that it has rewards."""
     return still(env, steps, action=-0.5)["next"]
 
 
@@ -202,7 +202,7 @@ def test_a_snapshot_continues_exactly(env, names):
     assert (first["next", "observation"][..., -1] != 1).any()
     for key in ("observation", "reward", "terminated", "cost_interventions"):
         assert torch.equal(first["next", key], second["next", key])
-    # a state that tells of worlds only: episodes' budgets begin anew
+    # without the states of transforms, the budgets of the episodes begin again
     begun = env.set_state(state.exclude("transforms"))
     assert begun["observation"].shape == first["observation"][:, 0].shape
 
@@ -210,7 +210,7 @@ def test_a_snapshot_continues_exactly(env, names):
 def test_transforms_of_torchrl_can_stand_among_ours():
     env = transformed(PointMass(2), "saute", count=StepCounter())
     check_env_specs(env)
-    # what they remember is in no snapshot
+    # what TorchRL's transforms store is in no state
     assert env.get_state() is None
     for add in (TransformedEnv.append_transform, lambda env, t: env.insert_transform(0, t)):
         env = transformed(PointMass(2), "saute", "noise")

@@ -69,7 +69,7 @@ def random_actions(env):
 
 
 def same_start(other, state, row):
-    """Put one of the states into Gymnasium's environment, as it puts one there at a reset."""
+    """Put one of the states into Gymnasium's environment, as its own reset does."""
     mujoco.mj_resetData(other.model, other.data)
     other.set_state(state["qpos"][row].numpy(), state["qvel"][row].numpy())
 
@@ -138,7 +138,7 @@ def test_starts_are_distributed_as_gymnasiums(name):
         assert ks_2samp(mine, its).pvalue > 1e-4
         assert abs(mine.std() / its.std() - 1) < 0.15
     assert abs(np.corrcoef(ours.T) - np.eye(ours.shape[1])).max() < 0.2
-    # all positions at once: by single columns a scale that is a tenth smaller is not told
+    # all positions at once, because single columns do not show a scale that is a tenth smaller
     noise = ours[:, : len(other.init_qpos)] - other.init_qpos
     scale = VELOCITY_SUITE[name].reset_noise_scale
     assert kstest(noise.ravel() / scale, uniform(-1, 2).cdf).pvalue > 1e-3

@@ -59,13 +59,13 @@ ENVIRONMENTS = {
 
 
 def transformed(env, *names, evaluating=False, seed=None, **others):
-    """The environment of a name, or one, with transforms of their names, or others."""
+    """An environment, or that of a name, with the transforms of some names and the others."""
     env = ENVIRONMENTS[env]() if isinstance(env, str) else env
     made = {name: TRANSFORMS[name]() for name in names} | others
     return transform_env(env, made, evaluating=evaluating, seed=seed)
 
 
 def still(env, steps, action=0.0):
-    """Rollout of a point that does nothing, over the ends of episodes."""
+    """Rollout with one and the same action, over the ends of episodes."""
     chosen = torch.full(env.action_spec.shape, action)
     return env.rollout(steps, lambda td: td.set("action", chosen), break_when_any_done=False)
