@@ -204,7 +204,10 @@ class ActionRepeat(ConstraintTransform):
             after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
             after.update({key: result.get(key) | after.get(key) for key in events})
             taken += active
-            result = after if active.all() else _where(active, after, result)
+            if not active.all():
+                before = result.select(*after.keys(True, True))
+                after = torch.where(active.reshape(after.batch_size), after, before)
+            result = after
         self._rows = {STEPS_TAKEN: taken}
         return self._call(result)
 
@@ -223,12 +226,6 @@ class ActionRepeat(ConstraintTransform):
         for key in list(reward_spec.keys(True, True)):
             reward_spec[key] = _times(reward_spec[key], self.steps_per_decision)
         return reward_spec
-
-
-def _where(mask: Tensor, one: TensorDictBase, other: TensorDictBase) -> TensorDictBase:
-    """Rows of `one` where the mask [N, 1] is True, of `other` elsewhere."""
-    rows = mask.reshape(one.batch_size)
-    return torch.where(rows, one, other.select(*one.keys(True, True)))
 
 
 def _times(spec: TensorSpec, factor: int) -> TensorSpec:

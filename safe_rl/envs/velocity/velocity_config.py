@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
 from types import MappingProxyType
 from typing import Annotated, Any, get_type_hints
 
@@ -163,7 +162,7 @@ class VelocityConfig:
     def __post_init__(self) -> None:
         _check_keys(self.robot, self.to_dict())
         for key, default in RUNNERS[self.robot].defaults.items():
-            value, values = getattr(self, key), _values(key)
+            value, values = getattr(self, key), _VALUES[key]
             if value is None or not values.hold(value):
                 raise ConfigError(
                     f"Configuration key '{key}' must be {values.words.removesuffix(', or null')}, "
@@ -207,11 +206,8 @@ def _check_keys(robot: Any, given: Any) -> None:
             raise ConfigError(f"Robot '{robot}' has no configuration key '{key}'.{hint}")
 
 
-@cache
-def _values(key: str) -> Values:
-    """Return the values that a key may have."""
-    return values_of(get_type_hints(VelocityConfig, include_extras=True)[key])
-
+_ANNOTATIONS = get_type_hints(VelocityConfig, include_extras=True)
+_VALUES = {key: values_of(annotation) for key, annotation in _ANNOTATIONS.items()}
 
 VELOCITY_SUITE: dict[str, VelocityConfig] = {
     f"Safe{row.gymnasium_id.removesuffix('-v5')}Velocity": VelocityConfig.from_dict({"robot": name})
