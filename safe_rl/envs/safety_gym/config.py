@@ -9,8 +9,6 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Any, NamedTuple, get_type_hints
 
-import numpy as np
-
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config_keys import RETIRED, Key, Vocabulary
 from safe_rl.naming import did_you_mean
@@ -46,7 +44,7 @@ class SafetyGymConfig(Vocabulary):
     def __init__(self, **values: Any) -> None:
         for name, (harmless, instead) in RETIRED.items():
             value = values.pop(name, harmless)
-            if (value.item() if isinstance(value, np.generic) else value) is not harmless:
+            if _plain(value) is not harmless:
                 raise ConfigError(
                     f"Configuration key '{name}' does not exist any more: {instead}. Got {value!r}."
                 )

@@ -54,8 +54,8 @@ def boundary_cost(xy: Tensor, half_x: float | None, half_y: float | None) -> Ten
 
     None is no boundary. The circle task of CPO (Achiam et al. 2017, section 8.1) has one in x.
     """
-    (x, y), halves = xy.abs().unbind(-1), (half_x, half_y)
-    most_x, most_y = (math.inf if half is None else half for half in halves)
+    x, y = xy.abs().unbind(-1)
+    most_x, most_y = (math.inf if half is None else half for half in (half_x, half_y))
     return (x - most_x).clamp_(min=0.0).add_((y - most_y).clamp_(min=0.0))
 
 
