@@ -83,12 +83,14 @@ def test_the_outermost_block_lets_go_also_if_it_fails(folder):
 def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
     """Such as the workers of a run that was killed."""
 
+    def outlive(ready, child):  # runs once the fork has let go of the lock
+        child.value = os.getpid()
+        ready.set()
+        time.sleep(2 * PATIENCE)
+
     def hold_and_fork(ready, child):
         with lock_folder(folder):
-            grandchild = FORK.Process(target=time.sleep, args=(2 * PATIENCE,))
-            grandchild.start()
-            child.value = grandchild.pid
-            ready.set()
+            FORK.Process(target=outlive, args=(ready, child)).start()
             time.sleep(2 * PATIENCE)
 
     ready, child = FORK.Event(), FORK.Value("i")
