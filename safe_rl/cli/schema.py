@@ -140,6 +140,9 @@ _ELSEWHERE = {
     **dict.fromkeys(("environment", "environment_name", "env_name", "env_id", "task"), "env"),
     **dict.fromkeys(("algorithm", "algo_name"), "algo"),
     **dict.fromkeys(("dir", "directory", "log_dir", "output_dir", "run_dir"), "hydra.run.dir"),
+}
+"""Name of a key in other libraries -> the key."""
+_SYNONYMS = {
     **dict.fromkeys(("clip", "clip_ratio", "clip_range", "clip_coef"), "clip_epsilon"),
     **dict.fromkeys(("discount", "discount_factor"), "gamma"),
     **dict.fromkeys(("epochs", "n_epochs", "num_epochs", "update_iters"), "num_passes"),
@@ -147,7 +150,7 @@ _ELSEWHERE = {
     **dict.fromkeys(("learning_rate", "actor_lr", "pi_lr"), "lr"),
     "target_kl": "max_kl",
 }
-"""Name of a key in other libraries -> the key, or its last part."""
+"""Last part of a key in other libraries -> the last part of the key."""
 _LIKENESS = 0.6
 """Similarity from which on a key counts as a misspelling of another one."""
 
@@ -218,10 +221,11 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
     known, unread = dict(_keys_of(values)), tuple(f"{path}." for path in unread_by(values))
     read = [path for path in known if path != key and not f"{path}.".startswith(unread)]
     held = [path for path in read if known[path]]
-    section, _, name = key.rpartition(".")
-    is_own = any(path.endswith(f".{name}") for path in read)
-    ours = key if is_own else join_keys(section, _ELSEWHERE.get(name, name))
-    meant = _nearest_keys(ours, held) or _nearest_keys(ours, read) or [ours] * (ours != key)
+    elsewhere = [_ELSEWHERE[key]] if key in _ELSEWHERE else []
+    above, _, name = key.rpartition(".")
+    is_own = any(path.endswith(f".{name}") for path in read)  # some steps have a target_kl
+    ours = key if is_own else join_keys(above, _SYNONYMS.get(name, name))
+    meant = elsewhere or _nearest_keys(ours, held) or _nearest_keys(ours, read)
     names = " or ".join(f"'{'' if known.get(path, True) else '+'}{path}'" for path in meant)
     how = f"A new key is added by +{key}=…" if "." in key else "'--cfg job' prints all keys."
     return f"there is no key '{key}'. {f'Did you mean {names}?' if names else how}"

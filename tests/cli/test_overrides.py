@@ -25,10 +25,13 @@ RIGHT = [
 WRONG = {
     "env.hazard_num=3": r"there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?",
     "total_timesteps=3": "there is no key 'total_timesteps'. Did you mean 'frames'",
+    "max_steps=3": r"there is no key 'max_steps'\. Did you mean 'frames'\?$",
+    "task=PointGoal2": r"there is no key 'task'\. Did you mean 'env'\?$",
     "environment=PointGoal2": "there is no key 'environment'. Did you mean 'env'",
     "algo_name=cpo": "there is no key 'algo_name'. Did you mean 'algo'",
     "learning_rate=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optim",
     "loss.clip_ratio=0.1": r"Did you mean 'loss\.clip_epsilon'\?$",
+    "target_kl=0.1": "Did you mean 'policy_update.max_kl'",
     "discount=0.9": r"Did you mean 'cost_advantage\.gamma' or 'advantage\.gamma'\?$",
     "epochs=4": "Did you mean 'policy_update.num_passes'",
     "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
@@ -161,6 +164,7 @@ MEANT = {
     ("sac", "+lr=1e-3"): "policy_update.optimizer.lr",
     ("sac", "gamma=0.9"): "loss.gamma",
     ("cpo", "policy_update.max_kl=0.1"): "policy_update.target_kl",
+    ("cpo", "target_kl=0.1"): "policy_update.target_kl",
 }
 
 
