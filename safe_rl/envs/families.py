@@ -148,6 +148,10 @@ TORCHRL = ForeignFamily(
     describe="safe_rl.envs.torchrl.torchrl_env:describe_node",
 )
 
+FOREIGN = {
+    "gymnasium": GYMNASIUM, "torchrl": TORCHRL, "safety_gymnasium": SAFETY_GYMNASIUM
+}  # fmt: skip
+"""Name in the group `env` -> family of another library; its environment is named by `id`."""
 GROUP = "env"
 """The group of environments in Hydra."""
 VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
@@ -185,10 +189,7 @@ _SUITES: dict[str | None, Mapping[str, Any]] = {
 FAMILIES: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
     None: partial(_complete, resolve, None),
     VELOCITY_TARGET: partial(_complete, resolve_velocity, VELOCITY_TARGET),
-    **{
-        foreign.target: partial(complete_foreign, foreign)
-        for foreign in (GYMNASIUM, TORCHRL, SAFETY_GYMNASIUM)
-    },
+    **{family.target: partial(complete_foreign, family) for family in FOREIGN.values()},
 }
 """`_target_` -> function that completes a node. A node with another target is used as it is."""
 
@@ -227,7 +228,7 @@ def stored_node(name: str) -> dict[str, Any] | None:
 
 def known_names() -> list[str]:
     """Return the names that `make_env` takes: those of all families, and the stored ones."""
-    return [*env_names(), *(key.removesuffix(".yaml") for key in _stored())]
+    return [*env_names(), *FOREIGN, *(key.removesuffix(".yaml") for key in _stored())]
 
 
 def _stored() -> Mapping[str, Any]:

@@ -11,6 +11,7 @@ import torch
 from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import (
+    FOREIGN,
     VELOCITY_TARGET,
     config_node,
     env_names,
@@ -36,6 +37,7 @@ def make_env(
     num_threads: int = 0,
     transforms: Mapping[str, Any] | None = None,
     evaluating: bool = False,
+    **keys: Any,
 ) -> ConstrainedEnv:
     """Make a batch of environments of any family.
 
@@ -48,6 +50,7 @@ def make_env(
         num_threads: Largest number of threads that step them; 0 for one per core.
         transforms: Name -> transform, or its node, as `transform_env` takes them.
         evaluating: Whether policies are evaluated; transforms that only help learning are then off.
+        keys: Keys of the environment to change, such as ``hazards_num=12``.
 
     Raises:
         ConfigError: For an unknown name or key, or a value that cannot be used.
@@ -55,22 +58,25 @@ def make_env(
         ContractError: If an environment of the user's family does not fulfil the contract.
 
     Examples:
+        >>> make_env("PointGoal1", num_envs=2, hazards_num=12).config.hazards_num
+        12
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
-    if isinstance(env, VelocityConfig):
-        env = config_node("custom", env, VELOCITY_TARGET)
-    env = _named(env) if isinstance(env, str) else env
-    target = env.get("_target_") if isinstance(env, Mapping) else None
-    build = SafetyGymEnv if target is None else locate(target, key="env._target_")
-    if isinstance(env, Mapping):
-        env = {key: value for key, value in env.items() if key not in ("_target_", "name")}
     given: dict[str, Any] = {
         "num_envs": num_envs, "device": device, "seed": seed, "num_threads": num_threads
     }  # fmt: skip
+    node = dict(_node(env))
+    for key in keys.keys() - node.keys():
+        if meant := did_you_mean(key, [*given, "transforms"], 0.85):
+            raise ConfigError(f"There is no argument '{key}'.{meant}")
+    node |= keys
+    target = node.pop("_target_", None)
+    node.pop("name", None)
+    build = SafetyGymEnv if target is None else locate(target, key="env._target_")
     if target is not None:
-        _check_arguments(build, target, env, given)
-    made = build(env, **given)
+        _check_arguments(build, target, node, given)
+    made = build(node, **given)
     if transforms:
         made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
     if target is not None or transforms:
@@ -96,18 +102,24 @@ def _check_arguments(
         ) from None
 
 
-def _named(name: str) -> str | dict[str, Any]:
-    """Return the node of a name; a name as in the 2019 engine is returned as it is."""
-    if name in env_names():
-        return env_node(name)
-    stored = stored_node(name)
-    if stored is not None:
+def _node(env: Any) -> Mapping[str, Any]:
+    """Return the node of a name (also as in the 2019 engine), a mapping or a configuration."""
+    if isinstance(env, Mapping):
+        return env
+    if isinstance(env, VelocityConfig):
+        return config_node("custom", env, VELOCITY_TARGET)
+    if not isinstance(env, str):
+        return config_node("custom", resolve(env))
+    if env in env_names():
+        return env_node(env)
+    if env in FOREIGN:
+        return {"_target_": FOREIGN[env].target}
+    if (stored := stored_node(env)) is not None:
         return stored
     try:
-        resolve(name)
+        return config_node("custom", resolve(env))
     except ConfigError:
         raise ConfigError(
-            f"Unknown environment '{name}'.{did_you_mean(name, known_names())} If a module of "
+            f"Unknown environment '{env}'.{did_you_mean(env, known_names())} If a module of "
             "yours stores it by that name (store_config), import the module first."
         ) from None
-    return name

@@ -66,6 +66,29 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
         make_env(node)
 
 
+@pytest.mark.parametrize(
+    "name", ["Safexp-PointGoal1-v0", "SafeHopperVelocity", {"robot_base": "car"}, "torchrl"]
+)
+def test_keys_change_an_environment_of_any_family(name):
+    torchrl = {"id": "PendulumEnv", "outside": {"cost_angle": ["th", -1, 1]}}
+    keys = {"num_steps": 6, **(torchrl if name == "torchrl" else {})}
+    assert make_env(name, num_envs=2, seed=0, **keys).max_episode_steps == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "meant"),
+    [
+        ("PointGoal1", "num_env", "num_envs"),
+        ("gymnasium", "devices", "device"),
+        ("SafeHopperVelocity", "num_step", "num_steps"),
+        ("PointGoal1", "hazard_num", "hazards_num"),
+    ],
+)
+def test_a_wrong_argument_names_the_nearest_argument_or_key(name, key, meant):
+    with pytest.raises(ConfigError, match=f"'{key}'.*Did you mean '{meant}'"):
+        make_env(name, **{key: 3})
+
+
 @pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
 def test_a_changed_configuration_is_made_and_stored(name):
     changed = make_env(name, seed=0).config.replace(num_steps=7)
@@ -74,6 +97,8 @@ def test_a_changed_configuration_is_made_and_stored(name):
     assert make_env("Brief", seed=0).config == changed
     with pytest.raises(ConfigError, match=r"a SafetyGymConfig; got a NoneType"):
         make_env(None)
+    with pytest.raises(ConfigError, match=r"a SafetyGymConfig; got a list"):
+        make_env(["PointGoal1"])
 
 
 def test_names_of_families_and_of_2019_are_known():
