@@ -119,7 +119,8 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     """Add runs to an archive, or update them there; their names are their paths below ``root``.
 
     Raises:
-        ValueError: If one folder lies in the other, or the archive is none or has other such runs.
+        ValueError: If one folder lies in the other, the archive is none, or it has other runs or
+            longer ones of these names.
         OSError: If it cannot be read or written.
     """
     here, there = root.resolve(), archive.resolve()
@@ -134,6 +135,12 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
             raise ValueError(
                 f"archive={archive}: its run {name} is another one than that in {root}: they "
                 f"differ in {', '.join(found)}. Give another folder for these runs."
+            )
+        longest, steps = max(kept[name].table.get("steps", [0])), names[name].steps
+        if longest > steps:
+            raise ValueError(
+                f"archive={archive}: its run {name} has {longest:,.0f} steps, that in {root} only "
+                f"{steps:,}, which would replace them. Give another folder for these runs."
             )
     write_archive(kept | names, archive)
 

@@ -144,6 +144,16 @@ def test_an_archive_is_not_among_the_runs_and_keeps_others_of_their_names(runs, 
     assert read_archive(tmp_path / "kept")["ppo/seed0"].config["env"]["name"] == "PointGoal1"
 
 
+def test_a_run_that_began_again_does_not_replace_the_longer_one(runs, tmp_path):
+    kept, run = tmp_path / "kept", runs / "PointGoal1" / "ppo" / "seed0"
+    keep(runs, kept)
+    lines = (run / "progress.csv").read_text().splitlines(keepends=True)
+    (run / "progress.csv").write_text("".join(lines[:3]))
+    with pytest.raises(ValueError, match=r"ppo/seed0 has 3,000 steps.* only 2,000"):
+        archive_runs(find_runs(runs)[0], runs, kept)
+    assert read_archive(kept)["PointGoal1/ppo/seed0"].steps == 3000
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
