@@ -92,7 +92,7 @@ def _label(figure: Figure, axes: Axes, name: str, *, from_zero: bool) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.grid(alpha=0.3)
     if from_zero:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(bottom=-0.02 * axes.get_ylim()[1])  # so that a line at zero is visible
     # stacked: side by side, names of costs would reach into the next panel
     below = ScaledTranslation(0, _TO_LEGEND, figure.dpi_scale_trans)
     axes.legend(
