@@ -126,6 +126,15 @@ def test_how_much_too_high_the_cost_critics_of_sac_lagrangian_are(env):
     assert re.search(words, sentences(OFF_POLICY))
 
 
+def test_a_million_steps_on_policy():
+    algos = ("ppo_lagrangian", "trpo_lagrangian", "cpo", "pcpo")
+    runs = [seeds_of(RESULTS / "algorithms" / "PointGoal1" / algo) for algo in algos]
+    costs = sorted(means(of_algo, 0.25, "{1:.1f}") for of_algo in runs)
+    said = "`, `".join(algos) + f"`: on PointGoal1 their mean costs are {costs[0]} to {costs[-1]}"
+    assert said in ALGORITHMS
+    assert {kept(of_algo).partition(",")[0] for of_algo in runs} == {"2 of 3"}
+
+
 def quarters_of(steps, returns, costs):
     """Means over each quarter million of steps."""
     quarters = (steps - 1) // 250_000
@@ -273,6 +282,16 @@ def test_how_many_runs_are_within_the_limit():
     ten = [held(run)[1] for run in runs if re.search("PointGoal1/(p|tr)po_lagr", str(run))]
     shares = f"{100 * min(ten):.0f} to {percent(max(ten))}"
     assert f", {shares} of the epochs from one million steps on" in sentences(HOLDING)
+
+
+def test_how_many_episodes_exceed_the_limit_under_certified_policies():
+    tests = [t for run in campaign("held_out").values() for t in run.notes.get("evaluations", ())]
+    found = [test["estimates"] for test in tests if test["checkpoint"] == "certified"]
+    shares = [e["over_limit_cost"]["value"] for e in found if e["episode_cost"]["value"] >= 22]
+    assert np.mean(shares) == pytest.approx(1 / 3, abs=0.03)
+    assert max(abs(share - 1 / 3) for share in shares) < 0.1
+    said = sentences((ROOT / "docs" / "concepts.md").read_text())
+    assert "whose mean cost is 22 or more, about a third of the episodes cost more than" in said
 
 
 def test_what_is_said_of_pushing():
