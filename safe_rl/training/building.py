@@ -114,7 +114,8 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
     """Load the trained weights of the run that ``init_from`` names into an algorithm's networks.
 
     Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
-    if that run had the same constrained costs and, with Q functions, the same loss.
+    if that run had the same constrained costs, the same risk measure and, with Q functions, the
+    same loss.
 
     Args:
         algorithm: The algorithm of the new run.
@@ -137,7 +138,7 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
             f"init_from={source}: there is no checkpoint. Give the folder of a run, or a file in "
             "its folder 'checkpoints'."
         )
-    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _cost_loss(config))
+    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _estimated(config))
     taken = {
         name: network
         for name, network in algorithm.networks.items()
@@ -157,18 +158,19 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
     return list(taken)
 
 
-def _cost_critics(checkpoint: Path) -> tuple[list[str], str | None]:
-    """Cost keys of the cost critic in a checkpoint, empty if unknown, and its loss."""
+def _cost_critics(checkpoint: Path) -> tuple[list[str], tuple[Any, Any]]:
+    """Cost keys of the cost critic in a checkpoint, empty if unknown, and what it estimates."""
     run = RunFolder(run_of(checkpoint)[0])
     config = read_config(run.config) if run.is_run else {}
     is_constrained = (config.get("algo") or {}).get("constrained", False)
     costs = list(config.get("cost_limits", {})) if is_constrained else []
-    return costs, _cost_loss(config)
+    return costs, _estimated(config)
 
 
-def _cost_loss(config: Mapping[str, Any]) -> str | None:
-    """Loss of Q functions, which decides what they estimate, such as a mean or a variance."""
-    return (config.get("loss") or {}).get("_target_") if config.get("critics") else None
+def _estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
+    """What decides which measure cost critics estimate: the risk, and the loss of Q functions."""
+    loss = (config.get("loss") or {}).get("_target_") if config.get("critics") else None
+    return (config.get("risk") or {}).get("_target_"), loss
 
 
 def _check_shapes(

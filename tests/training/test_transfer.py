@@ -73,6 +73,12 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
     assert take_over(trained, *overrides)[1] == ["actor", "critic"]
 
 
+def test_the_cost_critic_stays_new_with_another_risk_measure(trained):
+    risk, source = {"_target_": "safe_rl.objectives.CVaR"}, trained.record.directory
+    fresh = make_fresh(trained).algorithm
+    assert begin_from(fresh, {"init_from": source, "risk": risk}) == ["actor", "critic"]
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [
