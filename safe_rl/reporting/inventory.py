@@ -14,12 +14,10 @@ from safe_rl.scores.bounds import rounded_up
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
 
-def _each_run(
-    experiments: Sequence[Experiment],
-) -> Iterator[tuple[dict[str, Any], Experiment, Run]]:
+def _each_run(experiments: Sequence[Experiment]) -> Iterator[tuple[dict[str, Any], Run]]:
     for e in experiments:
         place = {"environment": e.environment, "algorithm": e.algorithm}
-        yield from (({**place, "seed": run.seed}, e, run) for run in e.runs)
+        yield from (({**place, "seed": run.seed}, run) for run in e.runs)
 
 
 def _names(records: Sequence[Record], start: str) -> list[str]:
@@ -42,7 +40,7 @@ def run_table(experiments: Sequence[Experiment]) -> Table:
             "code": run.code,
             "command": run.command or "not recorded",
         }
-        for where, _, run in _each_run(experiments)
+        for where, run in _each_run(experiments)
         for frames in [run.config["frames"]]
     ]
     columns = {
@@ -72,11 +70,9 @@ def duration(hours: float) -> str:
 
 def evaluation_table(experiments: Sequence[Experiment]) -> Table:
     """The results of ``python -m safe_rl.evaluate`` of all runs."""
-    records = [
-        {**where, **found, "other_measures": e.limits_of_other_measures}
-        for where, e, run in _each_run(experiments)
-        for found in run.evaluations
-    ]
+    runs = _each_run(experiments)
+    records = [{**where, **found} for where, run in runs for found in run.evaluations]
+    others = {(e.environment, e.algorithm): e.limits_of_other_measures for e in experiments}
     total = ["cost"] if any("episode_cost" in record for record in records) else []
     keys = list(dict.fromkeys([*total, *_names(records, "limit_")]))
     columns = {
@@ -98,7 +94,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 
     def over(row: Record) -> str:
         # a limit on another measure than the mean is not judged by these episodes' mean
-        judged = row.get("key") not in row["other_measures"]
+        judged = row.get("key") not in others[row["environment"], row["algorithm"]]
         return "bad" if judged and row.get("mean", 0.0) > row.get("limit", inf) else ""
 
     rows = each_cost(records, keys, **fields)
@@ -108,7 +104,7 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 def certificate_table(experiments: Sequence[Experiment]) -> Table:
     """The certificates of all runs that have one."""
     runs = _each_run(experiments)
-    records = [{**where, **run.certificate} for where, _, run in runs if run.certificate]
+    records = [{**where, **run.certificate} for where, run in runs if run.certificate]
     columns = {
         **_WHERE,
         "certified": "{certified}| at {surely}",
