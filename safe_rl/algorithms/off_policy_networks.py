@@ -14,7 +14,7 @@ from safe_rl.algorithms.build_part import build_part
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
 
-_ON_POLICY_ONLY = ("encoders", "memory", "normalise")
+_ON_POLICY_ONLY = ("_target_", "encoders", "memory", "normalise")
 
 
 def bounded_actions(env: EnvBase) -> TensorSpec:

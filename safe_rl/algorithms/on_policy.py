@@ -36,6 +36,7 @@ from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
+from safe_rl.targets import TargetError
 
 
 @dataclass
@@ -215,11 +216,22 @@ def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
 def _build_networks(
     config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
 ) -> dict[str, Any]:
-    return build_networks(
-        config.model,
-        env.observation_spec,
-        env.action_spec,
-        env.observation_layout,
-        num_costs=num_costs,
-        device=device,
-    )
+    """Networks of the node ``model``, by name; a ``_target_`` builds networks of the user's own."""
+    objects = {
+        "observation_spec": env.observation_spec,
+        "action_spec": env.action_spec,
+        "layout": env.observation_layout,
+        "num_costs": num_costs,
+        "device": device,
+    }
+    if (target := config.model.get("_target_")) is None:
+        return build_networks(config.model, **objects)
+    networks = build_part(config.model, **objects)
+    needed = ["actor", "critic", *(["cost_critic"] if num_costs else [])]
+    missing = set(needed).difference(networks if isinstance(networks, dict) else ())
+    if missing:
+        raise TargetError(
+            f"model._target_={target} must return a dictionary of networks with the names "
+            f"{', '.join(needed)}; it lacks {', '.join(sorted(missing))}."
+        )
+    return {name: networks[name] for name in needed}

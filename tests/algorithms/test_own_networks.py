@@ -1,0 +1,57 @@
+"""Networks that ``model._target_`` builds, for on-policy algorithms."""
+
+import pytest
+import torch
+from point_mass_runs import point_mass_trainer
+
+from safe_rl.models import make_actor, make_critic
+from safe_rl.targets import TargetError, allow
+
+TARGET = f"+model._target_={__name__}"
+
+
+def tall(hidden_sizes, initial_log_std, observation_spec, num_costs, *, layers=1, **others):
+    """Critics with more hidden layers than the policy."""
+    size = observation_spec["observation"].shape[-1]
+    widths = [*hidden_sizes] * layers
+    networks = {
+        "actor": make_actor(size, 2, hidden_sizes=hidden_sizes, initial_log_std=initial_log_std),
+        "critic": make_critic(size, hidden_sizes=widths),
+    }
+    if num_costs:
+        networks["cost_critic"] = make_critic(
+            size, hidden_sizes=widths, out_key="cost_value", num_outputs=num_costs
+        )
+    return networks
+
+
+def without_costs(observation_spec, **given):
+    return tall(observation_spec=observation_spec, num_costs=0, **given)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "cpo"])
+def test_a_run_trains_the_networks_of_a_function(algo, tmp_path):
+    allow(__name__)
+    limits = [] if algo == "ppo" else ["cost_limits={cost: 1, cost_north: 2}"]
+    own = [f"algo={algo}", f"{TARGET}.tall", "+model.layers=3", "frames=320", *limits]
+    trainer = point_mass_trainer(tmp_path, *own, minibatch_size=None)
+    networks = trainer.algorithm.networks
+    assert set(networks) == {"actor", "critic"} | ({"cost_critic"} if limits else set())
+    shapes = [tuple(p.shape) for p in networks["critic"].parameters() if p.ndim == 2]
+    assert shapes[1:] == [(16, 16), (16, 16), (1, 16)]
+    before = {name: next(network.parameters()).clone() for name, network in networks.items()}
+    trainer.run()
+    for name, network in networks.items():
+        assert not torch.equal(before[name], next(network.parameters()))
+
+
+def test_a_missing_network_is_named(tmp_path):
+    allow(__name__)
+    with pytest.raises(TargetError, match=r"without_costs must return .*; it lacks cost_critic\."):
+        point_mass_trainer(tmp_path, "algo=cpo", f"{TARGET}.without_costs", minibatch_size=None)
+
+
+def test_an_off_policy_algorithm_refuses_it(tmp_path):
+    allow(__name__)
+    with pytest.raises(ValueError, match=r"model\._target_ is for on-policy algorithms"):
+        point_mass_trainer(tmp_path, "algo=sac", f"{TARGET}.tall", minibatch_size=None)
