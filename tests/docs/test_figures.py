@@ -246,6 +246,18 @@ def test_the_campaign_at_one_commit():
         assert f"{told.partition(',')[0]} runs of" in sentences(page)
 
 
+def test_what_the_page_of_td3_lagrangian_says_of_two_tasks():
+    ends = {}
+    for env, algo in (("PointPush1", "sac"), ("PointPush1", "td3"), ("PointGoal2", "td3")):
+        runs = seeds_of(RESULTS / "held_out" / env / f"{algo}_lagrangian")
+        ends[env, algo] = cells_of(runs)[0].replace(" ± ", " / ").split(" / ")
+    page = sentences((ROOT / "docs" / "algorithms" / "td3_lagrangian.md").read_text())
+    of_sac, of_td3 = (" ± ".join(ends["PointPush1", algo][:2]) for algo in ("sac", "td3"))
+    assert f"{of_sac}, against {of_td3} of TD3-Lagrangian" in page
+    mean_return, _, cost, _ = ends["PointGoal2", "td3"]
+    assert f"the mean return was {mean_return} and the mean cost {cost}." in page
+
+
 def test_the_first_command_of_readme():
     runs = [RESULTS / "first_million" / p for p in campaign("first_million") if "/betting/" in p]
     returns, costs = kept(runs).removeprefix("6 of 6, at "), new_episodes(runs).partition(" (")[0]

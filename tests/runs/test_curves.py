@@ -80,6 +80,7 @@ def test_a_fourth_panel_has_the_multipliers_there_are():
     (line,) = panel.lines
     assert line.get_label() == "λ of cost"
     np.testing.assert_allclose(line.get_ydata(), multipliers["multiplier_cost"])
+    assert panel.get_ylim()[0] < 0  # a line at zero does not lie on the panel's edge
     assert len(drawn({"cost": 25.0})) == 3
 
 
