@@ -145,7 +145,18 @@ def _narrowed(kind: Any, metadata: Collection[Any]) -> Values:
             return item
         if isinstance(item, Range):
             return _within(item, whole=kind is int)
-    return values_of(kind)
+    bounds = {
+        name: value
+        for item in metadata
+        for name in ("gt", "ge", "lt", "le")
+        if (value := getattr(item, name, None)) is not None
+    }
+    if not bounds:
+        return values_of(kind)
+    low, high = (bounds.get(a, bounds.get(b)) for a, b in (("gt", "ge"), ("lt", "le")))
+    if kind is int and "gt" in bounds:
+        low, bounds = low + 1, {}
+    return _within(Range(low, high, "gt" in bounds, "lt" in bounds), whole=kind is int)
 
 
 def _within(range: Range, *, whole: bool) -> Values:

@@ -16,8 +16,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from safe_rl.checks import Checked
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.ranges import Checked
 from safe_rl.resumable import Resumable
 
 

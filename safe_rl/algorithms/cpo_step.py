@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import scipy  # its parts are loaded on first use, which takes half a second
 import torch
+from pydantic import PositiveFloat
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -14,7 +15,6 @@ from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TR
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.trust_region import flat_gradient
 from safe_rl.objectives.violation import constraint_value
-from safe_rl.ranges import Positive
 
 #: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
 _NO_GRADIENT = 1e-8
@@ -60,7 +60,7 @@ class CPOStep(TRPOStep):
         loss: Loss,
         *,
         rescale_violation: bool,
-        largest_demand: Positive | None = None,
+        largest_demand: PositiveFloat | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)

@@ -13,6 +13,8 @@ from functools import partial
 from typing import Annotated
 
 import torch
+from annotated_types import Interval
+from pydantic import PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -20,9 +22,10 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
+from safe_rl.checks import Share
 from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.ranges import PART, Count, Positive, Range, Share
+from safe_rl.ranges import PART
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +54,9 @@ class KLAdaptiveRate:
         0.0008
     """
 
-    factor: Annotated[float, Range(1, above=True)]
-    lowest: Annotated[float, Range(0, 1000, above=True)]
-    highest: Annotated[float, Range(0, 1000, above=True)]
+    factor: Annotated[float, Interval(gt=1)]
+    lowest: Annotated[float, Interval(gt=0, le=1000)]
+    highest: Annotated[float, Interval(gt=0, le=1000)]
     few_steps: Share
     low_kl: Share
 
@@ -128,11 +131,11 @@ class MinibatchUpdate(PolicyUpdate):
         loss: LossModule,
         *,
         optimizer: Annotated[Callable[[Iterable[nn.Parameter]], Optimizer], PART],
-        num_passes: Annotated[int, Range(1, 10**9)],
-        minibatch_size: Count | None,
-        max_kl: Positive | None = None,
+        num_passes: Annotated[int, Interval(ge=1, le=10**9)],
+        minibatch_size: PositiveInt | None,
+        max_kl: PositiveFloat | None = None,
         step_beyond_kl: bool = False,
-        max_grad_norm: Positive | None = None,
+        max_grad_norm: PositiveFloat | None = None,
         adapt_rate: Annotated[KLAdaptiveRate, PART] | None = None,
         compile: bool = False,
     ) -> None:

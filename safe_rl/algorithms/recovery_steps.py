@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from pydantic import NonNegativeFloat
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
+from safe_rl.checks import Fraction
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
-from safe_rl.ranges import Fraction, NotNegative
 
 
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
@@ -92,7 +93,7 @@ class CTRPOStep(TRPOStep):
         loss: Loss,
         cost_limits: CostLimits,
         *,
-        beta: NotNegative,
+        beta: NonNegativeFloat,
         hysteresis: Fraction,
         **settings: Any,
     ) -> None:
@@ -164,7 +165,7 @@ class CRPOStep(TRPOStep):
         tensor([0., 1.])
     """
 
-    def __init__(self, loss: Loss, *, tolerance: NotNegative, **settings: Any) -> None:
+    def __init__(self, loss: Loss, *, tolerance: NonNegativeFloat, **settings: Any) -> None:
         super().__init__(loss, **settings)
         self.tolerance = tolerance
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
+from pydantic import PositiveInt
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
@@ -13,7 +15,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
-from safe_rl.ranges import Checked, Count, Range, Share
+from safe_rl.checks import Checked, Share
 from safe_rl.resumable import Resumable
 
 _MOST_AT_ONCE = 16_384
@@ -66,12 +68,12 @@ class Memory(Checked):
     def __init__(
         self,
         *,
-        capacity: Annotated[int, Range(1, 10**8)],
-        batch_size: Count,
+        capacity: Annotated[int, Interval(ge=1, le=10**8)],
+        batch_size: PositiveInt,
         in_keys: Sequence[NestedKey],
         reward_keys: Sequence[NestedKey],
         reward_gamma: float,
-        n_steps: Annotated[int, Range(1, 1000)],
+        n_steps: Annotated[int, Interval(ge=1, le=1000)],
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,

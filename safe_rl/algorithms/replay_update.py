@@ -9,6 +9,8 @@ from itertools import chain
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
+from pydantic import PositiveFloat
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import CudaGraphModule
 from torch import Tensor, nn
@@ -17,9 +19,10 @@ from torchrl.objectives import SoftUpdate
 
 from safe_rl.algorithms.losses import ESTIMATOR, divergence, sum_of_losses
 from safe_rl.algorithms.replay_buffer import Memory
+from safe_rl.checks import Checked
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
-from safe_rl.ranges import PART, Checked, Positive, Range
+from safe_rl.ranges import PART
 
 _NO_GRAPH = (
     "If the loss reads numbers on the host (.item()) or branches on them (if), its gradient steps "
@@ -72,11 +75,11 @@ class ReplayUpdate(Checked):
         loss: ReplayLoss,
         *,
         optimizer: Annotated[Callable[[Iterable[Any]], Optimizer], PART],
-        updates_per_step: Positive,
-        tau: Annotated[float, Range(0, 0.5, above=True)] | None,
-        policy_delay: Annotated[int, Range(1, 10_000)] = 1,
-        rates: Mapping[str, Positive] | None = None,
-        max_grad_norm: Positive | None = None,
+        updates_per_step: PositiveFloat,
+        tau: Annotated[float, Interval(gt=0, le=0.5)] | None,
+        policy_delay: Annotated[int, Interval(ge=1, le=10_000)] = 1,
+        rates: Mapping[str, PositiveFloat] | None = None,
+        max_grad_norm: PositiveFloat | None = None,
         cuda_graph: bool = True,
     ) -> None:
         if not isinstance(loss, ReplayLoss):

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 from typing import Annotated, Any, NamedTuple
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat, PositiveFloat
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
@@ -14,6 +16,7 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import sum_of_losses
+from safe_rl.checks import Fraction
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.samples import learning_samples, require_finite
@@ -28,7 +31,6 @@ from safe_rl.objectives.trust_region import (
     subsample,
 )
 from safe_rl.objectives.violation import matched_violation
-from safe_rl.ranges import Fraction, NotNegative, Positive, Range
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
@@ -134,11 +136,11 @@ class TRPOStep(PolicyUpdate):
         self,
         loss: Loss,
         *,
-        target_kl: Positive,
-        damping: NotNegative,
-        cg_iterations: Annotated[int, Range(1, 10_000)],
-        backtrack_coeff: Annotated[float, Range(0, 1, above=True, below=True)],
-        max_backtracks: Annotated[int, Range(1, 10_000)],
+        target_kl: PositiveFloat,
+        damping: NonNegativeFloat,
+        cg_iterations: Annotated[int, Interval(ge=1, le=10_000)],
+        backtrack_coeff: Annotated[float, Interval(gt=0, lt=1)],
+        max_backtracks: Annotated[int, Interval(ge=1, le=10_000)],
         fisher_subsample: Fraction = 1.0,
         actor_network: ProbabilisticTensorDictSequential | None = None,
     ) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector, MultiSyncCollector
@@ -16,7 +17,7 @@ from torchrl.envs import EnvBase
 from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
-from safe_rl.ranges import Options, Range
+from safe_rl.ranges import Options
 
 
 def make_collector(
@@ -77,7 +78,7 @@ def make_process_collector(  # noqa: D417
     policy: TensorDictModuleBase,
     *,
     frames_per_batch: int,
-    num_collectors: Annotated[int, Range(1, 1024)],
+    num_collectors: Annotated[int, Interval(ge=1, le=1024)],
     device: torch.device | str,
 ) -> WorkerCollector:
     """Collect in processes of this machine; for other arguments see `WorkerCollector`.
@@ -112,7 +113,7 @@ def make_ray_collector(  # noqa: D417
     policy: TensorDictModuleBase,
     *,
     frames_per_batch: int,
-    num_collectors: Annotated[int, Range(1, 1024)],
+    num_collectors: Annotated[int, Interval(ge=1, le=1024)],
     device: torch.device | str,
     ray_init: Options,
     resources: Options,

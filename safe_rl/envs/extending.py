@@ -12,6 +12,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
+from pydantic import NonNegativeFloat, PositiveFloat
+
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import infer_key, registered_keys, set_registered_keys
@@ -33,7 +35,6 @@ from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
 from safe_rl.envs.safety_gym.world import World
 from safe_rl.naming import did_you_mean
-from safe_rl.ranges import NotNegative, Positive
 
 __all__ = [
     "BOX",
@@ -246,15 +247,15 @@ def _keys_of(element: Element) -> dict[str, Key]:
     keys = {
         "placements": Key(None, Placements),
         "locations": Key((), Locations),
-        "keepout": Key(0.4, NotNegative),
-        "size": Key(0.1, Positive),
+        "keepout": Key(0.4, NonNegativeFloat),
+        "size": Key(0.1, PositiveFloat),
     }
     if not element.singular:
         keys["num"] = Key(0, Objects)
     if element.is_free:
-        keys |= {"density": Key(0.001, Positive), "rots": Key((), tuple[float, ...])}
+        keys |= {"density": Key(0.001, PositiveFloat), "rots": Key((), tuple[float, ...])}
     if element.motion is Motion.GUIDED:
-        keys["travel"] = Key(0.3, NotNegative)
+        keys["travel"] = Key(0.3, NonNegativeFloat)
     named = {f"{element.kind}_{suffix}": key for suffix, key in keys.items()}
     return named if element.flag else {**named, f"observe_{element.kind}": Key(False, bool)}
 

@@ -6,8 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from annotated_types import Interval
+from pydantic import NonNegativeFloat, PositiveFloat
+
+from safe_rl.checks import Fraction, Share
 from safe_rl.parameters import parameters_of
-from safe_rl.ranges import Fraction, NotNegative, Positive, Range, Share, Values
+from safe_rl.ranges import Values
 
 PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
@@ -44,19 +48,19 @@ def option(default: Any, help: str) -> Any:
 class EvaluationOptions:
     """Options of ``python -m safe_rl.evaluate``; the help texts say what they mean."""
 
-    episodes: Annotated[int, Range(1, 10**8)] = option(100, "whole episodes to run")
+    episodes: Annotated[int, Interval(ge=1, le=10**8)] = option(100, "whole episodes to run")
     checkpoint: str = option(
         "last", "last, best (highest return that kept every limit), certified, or a path"
     )
     deterministic: bool = option(False, "act with the policy's mean instead of sampling from it")
-    seed: Annotated[int, Range(0, 2**62)] | None = option(
+    seed: Annotated[int, Interval(ge=0, le=2**62)] | None = option(
         None, "seed of layouts and actions; null: one that training never used"
     )
     # with upper bounds, because memory and the number of threads are limited
-    num_envs: Annotated[int, Range(1, 100_000)] = option(
+    num_envs: Annotated[int, Interval(ge=1, le=100_000)] = option(
         25, "environments that are stepped together"
     )
-    num_threads: Annotated[int, Range(0, 1024)] = option(
+    num_threads: Annotated[int, Interval(ge=0, le=1024)] = option(
         0, "threads that step them; 0: one per core"
     )
     device: Device = option("cpu", "where the policy acts: cpu or cuda")
@@ -71,7 +75,7 @@ class EvaluationOptions:
     certificate: dict[str, Any] = option(
         dict, "with certify=true: certificate.episodes=2000, as in training"
     )
-    cost_limits: dict[str, NotNegative] = option(
+    cost_limits: dict[str, NonNegativeFloat] = option(
         dict, "limits to use instead of the run's own, such as '{cost: 10}'"
     )
     name: Annotated[str, _NAME] = option(
@@ -101,13 +105,13 @@ class CertificateOptions:
         tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all episodes.
     """
 
-    ranking: Annotated[int, Range(2, 10**6)]
-    episodes: Annotated[int, Range(0, 10**6)]
-    tests: Annotated[int, Range(1, 1000)]
-    level: Annotated[float, Range(0.5, 1, above=True, below=True)]
+    ranking: Annotated[int, Interval(ge=2, le=10**6)]
+    episodes: Annotated[int, Interval(ge=0, le=10**6)]
+    tests: Annotated[int, Interval(ge=1, le=1000)]
+    level: Annotated[float, Interval(gt=0.5, lt=1)]
     most_over: Share
     bound: Literal["betting", "student"] = "betting"
-    cap: Positive | None = None
+    cap: PositiveFloat | None = None
     most_beyond: Share = 0.01
     tail: Fraction = 1.0
 

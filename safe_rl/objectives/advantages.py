@@ -20,9 +20,9 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
+from safe_rl.checks import Checked, Share
 from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
 from safe_rl.objectives.samples import require, require_finite, sample_mask
-from safe_rl.ranges import Checked, Share
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
 _ONE_PASS = "target_params needs two passes: use torchrl.objectives.value.GAE."

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat
 from torch import Tensor
 
+from safe_rl.checks import Weight
 from safe_rl.objectives.sac import SACLagrangianLoss
 from safe_rl.objectives.violation import KnownCosts
-from safe_rl.ranges import NotNegative, Range, Weight
 
 
 def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
@@ -84,9 +86,9 @@ class CALLoss(SACLagrangianLoss):
     def __init__(
         self,
         *networks: Any,
-        convexity: NotNegative,
+        convexity: NonNegativeFloat,
         ratio_memory: Weight,
-        largest_ratio: Annotated[float, Range(1)],
+        largest_ratio: Annotated[float, Interval(ge=1)],
         **settings: Any,
     ) -> None:
         super().__init__(*networks, **settings)

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
+from safe_rl.checks import Weight
 from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
-from safe_rl.ranges import NotNegative, Positive, Range, Weight
 
 
 class PIMultiplier(Multiplier):
@@ -48,10 +50,10 @@ class PIMultiplier(Multiplier):
         cost_limits: CostLimits,
         *,
         init: FromZero | Sequence[FromZero],
-        kp: NotNegative,
-        ki: NotNegative,
-        saturation: Positive,
-        highest: Positive,
+        kp: NonNegativeFloat,
+        ki: NonNegativeFloat,
+        saturation: PositiveFloat,
+        highest: PositiveFloat,
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)
@@ -115,13 +117,13 @@ class PIDMultiplier(Multiplier):
         cost_limits: CostLimits,
         *,
         init: FromZero | Sequence[FromZero],
-        kp: NotNegative,
-        ki: NotNegative,
-        kd: NotNegative,
+        kp: NonNegativeFloat,
+        ki: NonNegativeFloat,
+        kd: NonNegativeFloat,
         proportional_ema: Weight,
         derivative_ema: Weight,
-        derivative_delay: Annotated[int, Range(1, 100_000)],
-        scale: Positive | Sequence[Positive] | Literal["limit"],
+        derivative_delay: Annotated[int, Interval(ge=1, le=100_000)],
+        scale: PositiveFloat | Sequence[PositiveFloat] | Literal["limit"],
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from pydantic import FiniteFloat
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -15,7 +16,6 @@ from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
 from safe_rl.objectives.violation import KnownCosts
-from safe_rl.ranges import Number
 
 _COSTS = "cost_qvalue_network"
 
@@ -72,9 +72,9 @@ class CostCritics(QFunctionLoss):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
-        pessimism: Number = 0.0,
-        target_pessimism: Number | None = None,
-        lowest_cost_value: Number | None = None,
+        pessimism: FiniteFloat = 0.0,
+        target_pessimism: FiniteFloat | None = None,
+        lowest_cost_value: FiniteFloat | None = None,
         **settings: Any,
     ) -> None:
         device = next(cost_qvalue_network.parameters()).device

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from pydantic import NonNegativeFloat
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
@@ -11,10 +12,10 @@ from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
+from safe_rl.checks import Share
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import Distance, QFunctionLoss, ReplayLoss, check_ensemble
 from safe_rl.objectives.samples import require
-from safe_rl.ranges import NotNegative, Share
 
 
 class TD3Loss(QFunctionLoss, objectives.TD3Loss):
@@ -47,8 +48,8 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         *,
         action_spec: TensorSpec,
         gamma: Share,
-        policy_noise: NotNegative,
-        noise_clip: NotNegative,
+        policy_noise: NonNegativeFloat,
+        noise_clip: NonNegativeFloat,
         loss_function: Distance = "l2",
     ) -> None:
         check_ensemble(qvalue_network, "Q function of rewards")

@@ -8,14 +8,15 @@ are in `docs/algorithms/holding_the_limit.md`.
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
+from safe_rl.checks import Checked, Fraction, Share, Weight
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
 from safe_rl.objectives.risk import Charges
-from safe_rl.ranges import Checked, Count, Fraction, NotNegative, Positive, Range, Share, Weight
 from safe_rl.resumable import Resumable
 
 
@@ -174,21 +175,21 @@ class LimitTracker(Checked, Resumable):
         cost_limits: Tensor,
         *,
         max_length: float,
-        margin: NotNegative,
+        margin: NonNegativeFloat,
         largest_margin: Share,
-        free_steps: Annotated[int, Range(0)],
-        descent_steps: Annotated[int, Range(0)],
-        frames: Count,
+        free_steps: NonNegativeInt,
+        descent_steps: NonNegativeInt,
+        frames: PositiveInt,
         latest_end: Fraction,
-        smallest_scale: Positive,
-        drift: Positive | None,
+        smallest_scale: PositiveFloat,
+        drift: PositiveFloat | None,
         memory: Weight,
         lowest_trust: Fraction,
-        integral: NotNegative,
-        largest_integral: NotNegative,
+        integral: NonNegativeFloat,
+        largest_integral: NonNegativeFloat,
         recovery: Share = 1.0,
         largest_correlation: Weight = 0.0,
-        descent_errors: NotNegative = 0.0,
+        descent_errors: NonNegativeFloat = 0.0,
         steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()

@@ -12,15 +12,17 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import torch
+from annotated_types import Interval
+from pydantic import PositiveFloat
 from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.ranges import Checked, Positive, Range
+from safe_rl.checks import Checked
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
-AboveZero = Annotated[float, Range(0, 1e6, above=True)]
-FromZero = Annotated[float, Range(0, 1e6)]
+AboveZero = Annotated[float, Interval(gt=0, le=1e6)]
+FromZero = Annotated[float, Interval(ge=0, le=1e6)]
 
 
 def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]:
@@ -170,7 +172,7 @@ class LagrangeMultiplier(Multiplier):
     exp_avg_sq: Tensor
 
     def __init__(
-        self, cost_limits: CostLimits, *, init: AboveZero | Sequence[AboveZero], lr: Positive
+        self, cost_limits: CostLimits, *, init: AboveZero | Sequence[AboveZero], lr: PositiveFloat
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)
@@ -226,8 +228,8 @@ class ProjectedMultiplier(Multiplier):
         cost_limits: CostLimits,
         *,
         init: FromZero | Sequence[FromZero],
-        lr: Positive,
-        highest: Positive | None,
+        lr: PositiveFloat,
+        highest: PositiveFloat | None,
     ) -> None:
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest

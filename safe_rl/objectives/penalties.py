@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
 from safe_rl.objectives.policy_losses import PPOLoss, clipped_gain
 from safe_rl.objectives.violation import Violations, constraint_value, violation_of
-from safe_rl.ranges import NotNegative, Range
 
 
 class PenaltyLoss(PPOLoss):
@@ -81,7 +82,7 @@ class P3OLoss(PenaltyLoss):
 
     extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate")
 
-    def __init__(self, *parts: Any, kappa: NotNegative, **settings: Any) -> None:
+    def __init__(self, *parts: Any, kappa: NonNegativeFloat, **settings: Any) -> None:
         super().__init__(*parts, **settings)
         self.kappa = kappa
 
@@ -150,8 +151,8 @@ class IPOLoss(PenaltyLoss):
     def __init__(
         self,
         *parts: Any,
-        kappa: Annotated[float, Range(1e-9, 1e9)],
-        max_weight: Annotated[float, Range(1e-9, 1e9)],
+        kappa: Annotated[float, Interval(ge=1e-9, le=1e9)],
+        max_weight: Annotated[float, Interval(ge=1e-9, le=1e9)],
         **settings: Any,
     ) -> None:
         super().__init__(*parts, **settings)

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from safe_rl.checks import Fraction
 from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts
-from safe_rl.ranges import Fraction
 
 #: Which surrogates PPO clips besides that of the reward; see `PPOLagrangianLoss`.
 CostClipping = Literal["none", "pessimistic", "joint"]

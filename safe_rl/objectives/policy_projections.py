@@ -5,15 +5,17 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
+from pydantic import PositiveFloat
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.modules import set_recurrent_mode
 
+from safe_rl.checks import Share, Weight
 from safe_rl.objectives.distributions import has_closed_kl
 from safe_rl.objectives.samples import inputs_of
 from safe_rl.objectives.surrogate import WeighsCosts
-from safe_rl.ranges import Positive, Range, Share, Weight
 
 
 class FOCOPSLoss(WeighsCosts):
@@ -49,8 +51,8 @@ class FOCOPSLoss(WeighsCosts):
     def __init__(
         self,
         *parts: Any,
-        temperature: Annotated[float, Range(1e-9, 1e9)],
-        max_state_kl: Positive,
+        temperature: Annotated[float, Interval(ge=1e-9, le=1e9)],
+        max_state_kl: PositiveFloat,
         **settings: Any,
     ) -> None:
         super().__init__(*parts, **settings)

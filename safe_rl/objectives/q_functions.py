@@ -13,10 +13,10 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
+from safe_rl.checks import Checked
 from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.objectives.shared_tensors import SharesTensors
 from safe_rl.objectives.violation import KnownCosts
-from safe_rl.ranges import Checked
 
 
 @runtime_checkable

@@ -16,9 +16,11 @@ from abc import ABC, abstractmethod
 from typing import Annotated, NamedTuple
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeInt
 from torch import Tensor
 
-from safe_rl.ranges import Checked, Fraction, Range, Weight
+from safe_rl.checks import Checked, Fraction, Weight
 from safe_rl.resumable import Resumable
 
 
@@ -127,9 +129,9 @@ class CVaR(RiskMeasure):
         cost_limits: Tensor,
         *,
         tail: Fraction,
-        window: Annotated[int, Range(1, 10**6)],
-        ramp_start: Annotated[int, Range(0)],
-        ramp_steps: Annotated[int, Range(0)],
+        window: Annotated[int, Interval(ge=1, le=10**6)],
+        ramp_start: NonNegativeInt,
+        ramp_steps: NonNegativeInt,
         steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()

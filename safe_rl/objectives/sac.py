@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from annotated_types import Interval
+from pydantic import FiniteFloat
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
@@ -13,9 +15,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
+from safe_rl.checks import Share
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import Distance, QFunctionLoss, check_ensemble
-from safe_rl.ranges import Number, Range, Share
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
@@ -49,8 +51,8 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         qvalue_network: TensorDictModuleBase,
         *,
         gamma: Share,
-        alpha_init: Annotated[float, Range(1e-9, 1e9)],
-        target_entropy: Number | Literal["auto"] = "auto",
+        alpha_init: Annotated[float, Interval(ge=1e-9, le=1e9)],
+        target_entropy: FiniteFloat | Literal["auto"] = "auto",
         fixed_alpha: bool = False,
         loss_function: Distance = "l2",
         action_spec: TensorSpec | None = None,

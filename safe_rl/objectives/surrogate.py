@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from pydantic import NonNegativeFloat
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from safe_rl.checks import Checked
 from safe_rl.objectives.distributions import (
     composite_keys,
     composite_log_probs,
@@ -21,7 +23,6 @@ from safe_rl.objectives.distributions import (
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import inputs_of, require, sample_mask
 from safe_rl.objectives.shared_tensors import SharesTensors
-from safe_rl.ranges import Checked, NotNegative
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
@@ -100,7 +101,7 @@ class SurrogateLoss(Checked, SharesTensors):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        entropy_coeff: NotNegative,
+        entropy_coeff: NonNegativeFloat,
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")

@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import softplus
 from torchrl.objectives.utils import distance_loss
 
+from safe_rl.checks import Fraction
 from safe_rl.objectives.risk import CVaR
 from safe_rl.objectives.sac import SACLagrangianLoss
-from safe_rl.ranges import Fraction
 
 _SMALLEST = 1e-8
 """Lower bound of variances, so that their root has a finite slope, as in the published code."""

@@ -17,9 +17,9 @@ from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
+from safe_rl.checks import Text
 from safe_rl.extras import import_extra, needs_extra
 from safe_rl.files import replace_text
-from safe_rl.ranges import Text
 from safe_rl.runs.folder import RunFolder
 
 

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from registrations import POINT, cube, disc, register_mines
 from run_configs import CONF
 
+from safe_rl.checks import Share
 from safe_rl.envs import (
     ConfigError,
     SafetyGymConfig,
@@ -29,7 +30,6 @@ from safe_rl.envs.extending import (
     register_observation,
     register_task,
 )
-from safe_rl.ranges import Share
 
 pytestmark = pytest.mark.usefixtures("registrations_undone")
 

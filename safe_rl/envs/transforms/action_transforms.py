@@ -7,13 +7,15 @@ from inspect import signature
 from typing import Annotated, Any
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
+from safe_rl.checks import Text
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.naming import STEPS_TAKEN
-from safe_rl.ranges import PART, Range, Text
+from safe_rl.ranges import PART
 
 
 def _parameters(function: Callable[..., Any]) -> set[str]:
@@ -127,7 +129,7 @@ class ActionDelay(ConstraintTransform):
         torch.Size([1, 4])
     """
 
-    def __init__(self, steps: Annotated[int, Range(1, 1000)]) -> None:
+    def __init__(self, steps: Annotated[int, Interval(ge=1, le=1000)]) -> None:
         super().__init__()
         self._steps = steps
 
@@ -172,7 +174,7 @@ class ActionRepeat(ConstraintTransform):
         (4, 1000)
     """
 
-    def __init__(self, k: Annotated[int, Range(1, 1000)]) -> None:
+    def __init__(self, k: Annotated[int, Interval(ge=1, le=1000)]) -> None:
         super().__init__()
         self.steps_per_decision = k
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
+from safe_rl.checks import Checked
 from safe_rl.envs.costs import is_cost
 from safe_rl.naming import did_you_mean, key_name
-from safe_rl.ranges import Checked
 
 
 class ConstraintTransform(Checked, Transform):

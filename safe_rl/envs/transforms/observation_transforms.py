@@ -6,10 +6,13 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated
 
 import torch
+from annotated_types import Interval
+from pydantic import NonNegativeFloat
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
+from safe_rl.checks import Text, Weight
 from safe_rl.envs import rng
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.transforms.base import (
@@ -20,7 +23,6 @@ from safe_rl.envs.transforms.base import (
     widen,
 )
 from safe_rl.naming import did_you_mean
-from safe_rl.ranges import NotNegative, Range, Text, Weight
 
 
 class SensorNoise(ConstraintTransform):
@@ -41,7 +43,7 @@ class SensorNoise(ConstraintTransform):
         torch.Size([2, 60])
     """
 
-    def __init__(self, std: NotNegative, components: Sequence[Text] | None = None) -> None:
+    def __init__(self, std: NonNegativeFloat, components: Sequence[Text] | None = None) -> None:
         super().__init__()
         self._std = std
         self._components = None if components is None else list(components)
@@ -150,7 +152,7 @@ class PolicyMemory(ConstraintTransform):
         (torch.Size([2, 4]), True)
     """
 
-    def __init__(self, size: Annotated[int, Range(1, 16_384)]) -> None:
+    def __init__(self, size: Annotated[int, Interval(ge=1, le=16_384)]) -> None:
         super().__init__()
         self._size = size
 

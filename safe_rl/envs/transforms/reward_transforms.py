@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+from pydantic import FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 
+from safe_rl.checks import Fraction
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.transforms.base import (
     ConstraintTransform,
@@ -18,7 +20,6 @@ from safe_rl.envs.transforms.base import (
     unbounded_like,
     widen,
 )
-from safe_rl.ranges import Count, Fraction, NotNegative, Number, Positive
 
 BUDGET = "budget"
 _ROUNDING = 1e-7  # of a budget: the relative rounding error of costs in single precision is lower
@@ -60,7 +61,7 @@ class RewardScale(_ChangesReward):
         True
     """
 
-    def __init__(self, factor: Positive) -> None:
+    def __init__(self, factor: PositiveFloat) -> None:
         super().__init__()
         self._factor = factor
 
@@ -92,7 +93,9 @@ class EarlyTermination(ConstraintTransform):
         torch.Size([2, 3])
     """
 
-    def __init__(self, budgets: Mapping[str, NotNegative], in_evaluation: bool = False) -> None:
+    def __init__(
+        self, budgets: Mapping[str, NonNegativeFloat], in_evaluation: bool = False
+    ) -> None:
         super().__init__()
         self.in_evaluation = in_evaluation
         self.needed_costs = self._budgets = check_budgets(budgets, above_zero=False)
@@ -154,10 +157,10 @@ class Saute(_ChangesReward):
 
     def __init__(
         self,
-        budgets: Mapping[str, Positive],
+        budgets: Mapping[str, PositiveFloat],
         *,
         discount: Fraction,
-        unsafe_reward: Number,
+        unsafe_reward: FiniteFloat,
         rescale_budgets: bool,
     ) -> None:
         super().__init__()
@@ -248,7 +251,12 @@ class Simmer(Saute):
     """
 
     def __init__(
-        self, budgets: Mapping[str, Positive], *, first: Fraction, steps: Count, **settings: Any
+        self,
+        budgets: Mapping[str, PositiveFloat],
+        *,
+        first: Fraction,
+        steps: PositiveInt,
+        **settings: Any,
     ) -> None:
         super().__init__(budgets, **settings)
         self._first, self._steps = first, steps
