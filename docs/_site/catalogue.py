@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import algorithm_pages
-import algorithm_results
 import curves
 import mujoco
+import result_tables as results
 from run_keys import run_keys
 from tables import table as _table
-from velocity_tables import velocity_runs
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.config_keys import Vocabulary
@@ -184,11 +183,12 @@ TABLES: dict[str, Callable[..., str]] = {
     table.__name__: table
     for table in (
         *(benchmark, debug, velocity, keys, observations, lidars, costs, robots),
-        *(run_keys, velocity_runs, curves.curves),
+        *(run_keys, curves.curves),
         *(algorithm_pages.settings, algorithm_pages.columns, algorithm_pages.loop),
         algorithm_pages.listed,
-        *(algorithm_results.measured, algorithm_results.compared, algorithm_results.timed),
-        algorithm_results.spread_of_times,
+        *(results.held_out, results.rivals, results.paper_preset, results.coverage),
+        *(results.compared, results.measured, results.single, results.parts),
+        results.velocity_runs,
     )
 }
 

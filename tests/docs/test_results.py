@@ -1,0 +1,152 @@
+"""Tables and sentences on results are those of the archived runs."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+import result_tables as results
+
+from safe_rl.reporting.recorded import Run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def said(page):
+    """A page without its line breaks."""
+    return " ".join((ROOT / page).read_text().split())
+
+
+def run_of(costs, steps=10_000, certificate=None):
+    """A run whose epochs have these costs; returns are the numbers of the epochs."""
+    table = {
+        "steps": [steps * n for n in range(1, len(costs) + 1)],
+        "episode_return": [float(n) for n in range(1, len(costs) + 1)],
+        "episode_cost": costs,
+        "cost_rate": [0.5] * len(costs),
+    }
+    return Run(Path("run"), {}, table, {"certificate": certificate} if certificate else {})
+
+
+def test_figures_are_those_of_the_end_and_of_spans_of_20_000_steps():
+    run = run_of([90.0, 90.0, 10.0, 30.0, 30.0, 30.0])
+    # spans from 20,000 steps on have the means 20 and 30, of which one is above 25
+    assert results.figures(run, last=30_000, start=20_000) == {
+        "return": 5.0,
+        "cost": 30.0,
+        "since": 25.0,
+        "above": 0.5,
+        "rate": 0.5,
+    }
+
+
+def test_a_row_has_the_mean_and_the_deviation_among_seeds():
+    group = pandas.DataFrame({"run": [run_of([10.0, 20.0]), run_of([10.0, 30.0])]})
+    row = results.means(group, last=10_000)
+    assert (row["seeds"], row["cost"], row["return"]) == ("2", "25.0 ± 7.1", "2.0 ± 0.0")
+    assert results.means(group[:1], last=10_000)["cost"] == "20.0"
+
+
+def test_certificates_are_counted_among_the_runs_that_were_tested():
+    ends = [
+        None,
+        {"certified": True, "episode_return": 3.0},
+        {"certified": False, "episode_return": 1},
+    ]
+    group = pandas.DataFrame({"run": [run_of([1.0], certificate=end) for end in ends]})
+    assert results.certified(group) == "1 of 2, at 3.0"
+    assert results.certified(group[:1]) == "—"
+
+
+def test_readme_has_the_table_that_the_archive_gives():
+    text = (ROOT / "README.md").read_text()
+    assert results.fill_readme(text) == text
+    assert len(re.findall(r"^\| `\w+` \|", text, re.MULTILINE)) >= 6
+
+
+@pytest.fixture(scope="module")
+def held_out():
+    """Figures of the constrained runs of three million steps."""
+    runs = results.runs("held_out")
+    of_runs = pandas.DataFrame(results.figures(run, 5e5, 1e6) for run in runs.run)
+    tables = [pandas.DataFrame(run.table) for run in runs.run]
+    of_runs["first"] = [t[t.steps <= 1e6].episode_cost.mean() for t in tables]
+    return runs.reset_index(drop=True).join(of_runs)
+
+
+def test_what_is_said_of_the_limit(held_out):
+    kept, over, end = (
+        (held_out[key] <= top).sum() for key, top in (("since", 25), ("rate", 0.025), ("cost", 25))
+    )
+    first = held_out.groupby(["environment", "algorithm"])["first"].mean()
+    page, readme = said("docs/results.md"), said("README.md")
+    total = len(held_out)
+    assert f"{kept} of the {total} runs have a mean cost of at most 25" in page
+    assert f"{total - over} of the {total} are above the limit" in page
+    assert f"cost {first.min():.0f} to {first.max():.0f} per episode" in page
+    assert f"{kept} of the {total} constrained runs" in readme
+    assert f"over the whole training {total - over} of them are above it" in readme
+    certified = int(results.certified(held_out).split()[0])
+    assert (
+        f"{end} runs are within the limit over the last half million steps, and {certified}" in page
+    )
+    highest = re.search(r"to ([\d.]+) \(", results.new_episodes(held_out))[1]
+    assert f"a mean cost of at most {highest}" in readme
+
+
+def test_what_the_pages_of_algorithms_say_of_certificates(held_out):
+    for algo in ("ppo_lagrangian", "trpo_lagrangian", "cpo"):
+        told = results.certified(held_out[held_out.algorithm == algo]).partition(",")[0]
+        assert f"{told} runs of" in said(f"docs/algorithms/{algo}.md")
+
+
+def test_what_is_said_of_hard_tasks():
+    held = results.runs("held_actions").query("seed not in (110, 111)")
+    assert {results.certified(group).split(",")[0] for _, group in held.groupby("environment")} == {
+        "4 of 4",
+        "3 of 3",
+        "1 of 1",
+    }
+    for env in ("PointGoal2", "PointButton1", "PointPush1"):
+        returns = results.certified(held.query("environment == @env")).partition("at ")[2]
+        assert f"{returns} on {env}" in said("README.md")
+    goal = held.query("environment == 'PointGoal2'")
+    assert f"_c {results.means(goal, 5e5)['rate']})" in said("README.md")
+
+
+def test_the_first_command_of_readme():
+    six = results.runs("first_million").query("name == 'betting'")
+    returns = results.certified(six).removeprefix("6 of 6, at ")
+    costs = results.new_episodes(six).partition(" (")[0]
+    assert f"at returns of {returns}, and in 2,000" in said("docs/results.md")
+    assert f"mean costs of {costs}." in said("docs/results.md")
+
+
+def test_how_many_episodes_exceed_the_limit_under_certified_policies(held_out):
+    tests = [test for run in held_out.run for test in run.notes.get("evaluations", ())]
+    found = [test["estimates"] for test in tests if test["checkpoint"] == "certified"]
+    shares = [e["over_limit_cost"]["value"] for e in found if e["episode_cost"]["value"] >= 22]
+    assert np.mean(shares) == pytest.approx(1 / 3, abs=0.03)
+    assert "about a third of the episodes cost more than" in said("docs/concepts.md")
+
+
+def test_how_far_off_the_cost_critics_are():
+    costs, told = [], []
+    for run in (
+        results.runs("held_out")
+        .query("environment == 'PointGoal1' and algorithm == 'sac_lagrangian'")
+        .run
+    ):
+        told.append(np.mean(run.table["policy_cost_qvalue"][-100:]) * 1000 * (1 - 0.99))
+        costs.append(results.figures(run, 5e5)["cost"])
+    words = f"{min(told):.0f} to {max(told):.0f} on PointGoal1, where episodes cost"
+    assert f"{words} {min(costs):.0f} to {max(costs):.0f}." in said("docs/off_policy.md")
+
+
+def test_the_two_runs_on_a_gpu():
+    page = (ROOT / "docs" / "guides" / "gpu.md").read_text()
+    table = results.single("gpu")
+    for seed in ("0", "1321"):
+        end = re.search(rf"\| {seed} \|.*\| ([≤\d. at]+) \|$", table, re.MULTILINE)[1]
+        assert end in page
