@@ -9,13 +9,10 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
+from safe_rl.checks import SettingError
 from safe_rl.extras import require_extra
 from safe_rl.ranges import NotNegative, Range, Values, Weight, is_described, values_of
-from safe_rl.targets import locate
-
-
-class SettingError(ValueError):
-    """A value that a run cannot have; the message names the key."""
+from safe_rl.trust import locate
 
 
 class Parameter(NamedTuple):

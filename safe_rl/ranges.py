@@ -9,8 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, reduce, wraps
-from inspect import signature
+from functools import reduce
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union
 from typing import get_args as arguments_of
@@ -214,47 +213,6 @@ _PLAIN: dict[Any, Values] = {
     **{bool: _BOOLEAN, str: _TEXT, None: _NULL, NoneType: _NULL},
     **{kind: _within(Range(), whole=kind is int) for kind in (int, float)},
 }
-
-
-class Checked:
-    """Base of classes whose constructors refuse arguments that do not fit their annotations.
-
-    Numbers, texts and lists are checked; other objects are not.
-
-    Examples:
-        >>> class Discount(Checked):
-        ...     def __init__(self, *, gamma: Share): ...
-        >>> Discount(gamma=2)
-        Traceback (most recent call last):
-        ...
-        ValueError: gamma=2: it must be a number from 0 to 1.
-    """
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "__init__" in vars(cls):
-            cls.__init__ = _checked(vars(cls)["__init__"])  # type: ignore[method-assign]
-
-
-def _checked(init: Callable[..., None]) -> Callable[..., None]:
-    @cache
-    def allowed() -> dict[str, Values]:
-        try:
-            parameters = signature(init, eval_str=True).parameters.values()
-        except NameError:  # a name that is imported for type checkers only
-            return {}
-        return {p.name: values_of(p.annotation) for p in parameters if is_described(p.annotation)}
-
-    @wraps(init)
-    def checking(self: Any, *args: Any, **kwargs: Any) -> None:
-        given = dict(zip(signature(init).parameters, (self, *args), strict=False)) | kwargs
-        for name, values in allowed().items():
-            value = given.get(name)
-            if isinstance(value, int | float | str | list | tuple) and not values.hold(value):
-                raise ValueError(f"{name}={value}: it must be {values.words}.")
-        init(self, *args, **kwargs)
-
-    return checking
 
 
 Options = Annotated[dict[str, Any], _mapping(ANYTHING)]

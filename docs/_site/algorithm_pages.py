@@ -15,10 +15,10 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from setting_tables import own_parts, setting_table
 
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.files import CONF
 from safe_rl.parameters import accepted_names
-from safe_rl.targets import locate
+from safe_rl.trust import locate
 
 DOCS = Path(__file__).resolve().parents[1]
 # what the live arguments are called here
@@ -37,7 +37,7 @@ def listed(recipe: str) -> str:
     for page in sorted((DOCS / "algorithms").glob("*.md")):
         algo, text = page.stem, page.read_text()
         short = re.search(r"^<!-- row: (.*) -->$", text, re.M)
-        if short and find_recipe(_compose(algo, "default")).__name__ == recipe:
+        if short and find_algorithm(_compose(algo, "default")).__name__ == recipe:
             source = re.search(r"^`algo=\w+` · (.*)$", text, re.M)[1]  # type: ignore[index]
             rows.append(f"| [`{algo}`]({page.name}) | {short[1]} | {source} |")
     heads = "| `algo=` | problem it solves | policy step | source |\n|---|---|---|---|"

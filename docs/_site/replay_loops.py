@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.schema import KEYS
 from safe_rl.parameters import accepted_names
-from safe_rl.targets import locate
+from safe_rl.trust import locate
 
 NODES = ("memory",)
 # what is not a part; the first four are what such an algorithm brings along for the preset

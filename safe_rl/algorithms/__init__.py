@@ -1,6 +1,6 @@
-"""Algorithms: recipes, gradient updates, trust-region steps, and how they are built."""
+"""Algorithms: gradient updates, trust-region steps, and how they are built."""
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, Recipe, SequentialUpdates
+from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, SequentialUpdates
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.cpo_step import CPOStep, PCPOStep
 from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
@@ -25,7 +25,6 @@ __all__ = [
     "OnPolicy",
     "PCPOStep",
     "PolicyUpdate",
-    "Recipe",
     "ReplayUpdate",
     "SequentialUpdates",
     "TRPOStep",

@@ -1,4 +1,4 @@
-"""Interfaces between the training loop, recipes, algorithms and updates.
+"""Interfaces between the training loop, algorithms and updates.
 
 Each class here is a base class. Its optional methods have defaults.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol, Self
 
 import torch
 from omegaconf import DictConfig
@@ -41,6 +41,8 @@ def states_of(parts: Mapping[str, Stateful]) -> dict[str, Any]:
 class Algorithm(ABC):
     """Interface of algorithms for the training loop, checkpoints, transfer and evaluation.
 
+    A configuration names the class as ``algo._target_``.
+
     Attributes:
         cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
         policy: Exploring policy, for the collector; it shares the networks' parameters.
@@ -58,6 +60,27 @@ class Algorithm(ABC):
     cost_networks: Collection[str] = ()
     learns_from: str = ""
     schedule: str = ""
+
+    @classmethod
+    @abstractmethod
+    def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
+        """Build networks, losses and updates from a configuration as composed from ``conf/``.
+
+        Raises:
+            ValueError: If parts of the configuration do not fit together or the environment.
+        """
+
+    @classmethod
+    @abstractmethod
+    def build_policy(
+        cls, config: DictConfig, env: EnvBase, device: torch.device
+    ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
+        """Build only the policy, for evaluation.
+
+        Returns:
+            The policy, and the networks that it consists of, by the names that they have in
+            checkpoints.
+        """
 
     @property
     def lost_on_resume(self) -> str:
@@ -86,38 +109,6 @@ class Algorithm(ABC):
 
     def forget_open_episodes(self) -> None:
         """End the n-step sums of unfinished episodes, because new episodes begin."""
-
-
-class Recipe(ABC):
-    """Builds an algorithm from a configuration, which names the recipe as ``algo._target_``.
-
-    Attributes:
-        unused_keys: Keys of presets that the recipe does not use, and choices that do not suit it
-            (``preset=paper``), each with the reason. A command with one of them is refused.
-    """
-
-    unused_keys: ClassVar[Mapping[str, str]] = {}
-
-    @classmethod
-    @abstractmethod
-    def build(cls, config: DictConfig, env: EnvBase) -> Algorithm:
-        """Build everything from a configuration as composed from ``conf/``.
-
-        Raises:
-            ValueError: If parts of the configuration do not fit together or the environment.
-        """
-
-    @classmethod
-    @abstractmethod
-    def build_policy(
-        cls, config: DictConfig, env: EnvBase, device: torch.device
-    ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
-        """Build only the policy, for evaluation.
-
-        Returns:
-            The policy, and the networks that it consists of, by the names that they have in
-            checkpoints.
-        """
 
 
 class PolicyUpdate(Checked, Resumable, ABC):

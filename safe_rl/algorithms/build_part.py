@@ -1,90 +1,34 @@
-"""Build the parts of an algorithm, and its constraints, from nodes of a configuration.
-
-Parts with a ``_target_`` (losses, multipliers, updates, advantage estimators) may be classes of
-your own. A constructor gets the objects of the run, such as ``actor_network``, by their names.
-"""
+"""What every algorithm needs from a configuration: its class, its limits and its constraints."""
 
 from __future__ import annotations
 
 import math
 from inspect import isclass
-from typing import Any, TypeVar
 
 import torch
 from omegaconf import DictConfig
 from torchrl.envs import EnvBase
-from torchrl.objectives import LossModule
 
-from safe_rl.algorithms.algorithm_contract import Recipe
+from safe_rl.algorithms.algorithm_contract import Algorithm
 from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, check_cost_limits
-from safe_rl.objectives import Multiplier
-from safe_rl.parameters import accepted_names, required_names
-from safe_rl.targets import TargetError, build, locate
+from safe_rl.trust import TargetError, instantiate, locate
 
-Part = TypeVar("Part")
-
-_DEFAULT_RECIPE = "safe_rl.algorithms.OnPolicy"
+_DEFAULT = "safe_rl.algorithms.OnPolicy"
 
 
-def find_recipe(config: DictConfig) -> type[Recipe]:
-    """The recipe that a configuration names as ``algo._target_``; by default `OnPolicy`.
+def find_algorithm(config: DictConfig) -> type[Algorithm]:
+    """The class that a configuration names as ``algo._target_``; by default `OnPolicy`.
 
     Raises:
-        TargetError: If there is no such class, or it is not a recipe.
+        TargetError: If there is no such class, or it is not an algorithm.
     """
-    target = config.algo.get("_target_", _DEFAULT_RECIPE)
-    recipe = locate(target, "algo._target_")
-    if not (isclass(recipe) and issubclass(recipe, Recipe)):
+    target = config.algo.get("_target_", _DEFAULT)
+    algorithm = locate(target, "algo._target_")
+    if not (isclass(algorithm) and issubclass(algorithm, Algorithm)):
         raise TargetError(
-            f"algo._target_={target} is no recipe: derive it from safe_rl.algorithms.Recipe."
+            f"algo._target_={target} is no algorithm: derive it from safe_rl.algorithms.Algorithm."
         )
-    return recipe
-
-
-def build_part(node: DictConfig, **objects: Any) -> Any:
-    """Build the object that a node names, from the node's settings and objects of the run.
-
-    Its constructor gets those of the `objects` that are among its arguments and are not None.
-
-    Raises:
-        TargetError: If the target may not be built, or if building it fails.
-    """
-    target = locate(node.get("_target_"), f"{node._get_full_key(None)}._target_")
-    names = accepted_names(target)
-    has_none = "multiplier" in objects and objects["multiplier"] is None
-    if has_none and "multiplier" in required_names(target):
-        raise TargetError(
-            f"{node._get_full_key(None)}._target_={node._target_} needs a multiplier, and the "
-            "algorithm has none: add '- /lagrangian: ${preset}' to the defaults of its YAML file."
-        )
-    return build(node, **{k: v for k, v in objects.items() if v is not None and k in names})
-
-
-def build_update(node: DictConfig, kind: type[Part], **objects: Any) -> Part:
-    """Build an update of networks, as `build_part` does.
-
-    Raises:
-        TargetError: As in `build_part`, or if the result is not an update of this kind.
-    """
-    return _of_kind(build_part(node, **objects), kind, node, "update", "safe_rl.algorithms")
-
-
-def build_loss(node: DictConfig, **objects: Any) -> LossModule:
-    """Build a loss, as `build_part` does.
-
-    Raises:
-        TargetError: As in `build_part`, or if the result is not a loss module.
-    """
-    return _of_kind(build_part(node, **objects), LossModule, node, "loss", "torchrl.objectives")
-
-
-def _of_kind(part: Any, kind: type[Part], node: DictConfig, name: str, home: str) -> Part:
-    if not isinstance(part, kind):
-        raise TargetError(
-            f"{node._get_full_key(None)}._target_={node._target_} is no {name}: derive it from "
-            f"{home}.{kind.__name__}."
-        )
-    return part
+    return algorithm
 
 
 def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> dict[str, float]:
@@ -123,26 +67,21 @@ def build_constraints(
     Lengths of episodes are in decisions (time steps of a batch), schedules in environment steps.
 
     Raises:
-        TargetError: If the multiplier is not a `Multiplier`.
         ValueError: If a risk measure is named without a tracker.
     """
     multiplier = risk = None
     per_decision = env.steps_per_decision
     max_length = math.ceil(env.max_episode_steps / per_decision)
     if config.get("lagrangian") is not None:
-        node = config.lagrangian
-        built = build_part(node, cost_limits=limits)
-        multiplier = _of_kind(built, Multiplier, node, "multiplier", "safe_rl.objectives")
-        multiplier = multiplier.to(device)
+        multiplier = instantiate(config.lagrangian, cost_limits=limits).to(device)
     values = torch.tensor(list(limits.values()))
     if limits and _names_a_part(config.get("risk")):
-        risk = build_part(config.risk, cost_limits=values, steps_per_decision=per_decision)
+        risk = instantiate(config.risk, {"steps_per_decision": per_decision}, cost_limits=values)
     if limits and _names_a_part(config.get("limits")):
-        tracker = build_part(
+        tracker = instantiate(
             config.limits,
+            {"max_length": max_length, "steps_per_decision": per_decision},
             cost_limits=values,
-            max_length=max_length,
-            steps_per_decision=per_decision,
         )
         return TrackedConstraints(
             limits, tracker=tracker, multiplier=multiplier, risk=risk, device=device

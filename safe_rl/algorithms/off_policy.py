@@ -1,10 +1,10 @@
-"""The off-policy recipe: a replay buffer, and gradient steps on its minibatches."""
+"""Off-policy algorithms: a replay buffer, and gradient steps on its minibatches."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, Self
 
 import torch
 from omegaconf import DictConfig
@@ -13,14 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, Recipe, Stateful
-from safe_rl.algorithms.build_part import (
-    build_constraints,
-    build_loss,
-    build_part,
-    build_update,
-    constrained_limits,
-)
+from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
+from safe_rl.algorithms.build_part import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.off_policy_networks import bounded_actions, build_networks, exploring
@@ -30,26 +24,12 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
-
-_UNUSED = {
-    "advantage": "It learns values of single transitions, not advantages of batches: the discount "
-    "is loss.gamma, and memory.n_steps says how many steps a transition spans.",
-    "cost_advantage": "It learns values of single transitions, not advantages of batches.",
-    "compile": "torch.compile makes its updates slower. On a GPU its gradient steps are recorded "
-    "as CUDA graphs instead (policy_update.cuda_graph).",
-    "critic_update": "Its Q functions are trained together with the policy: policy_update.",
-    "then": "It has one update.",
-    "model.head": "The distribution of its actions is the algorithm's own, within their bounds.",
-    "model.initial_log_std": "Its network gives the standard deviation in every state.",
-    "model.normalise": "Fixed factors, model.input_scale, scale its observations.",
-    "preset=paper": "It is the setting of Ray, Achiam, Amodei (2019), none of whose algorithms "
-    "has a replay buffer: without it the algorithm has settings of its own.",
-}
+from safe_rl.trust import instantiate
 
 
 @dataclass
-class OffPolicy(Resumable, Algorithm, Recipe):
-    """SAC, TD3 and similar algorithms: the algorithm, and the recipe that builds it.
+class OffPolicy(Resumable, Algorithm):
+    """SAC, TD3 and similar algorithms.
 
     Attributes:
         policy: Exploring policy, with the actor's parameters.
@@ -67,7 +47,6 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         steps: Environment steps so far.
     """
 
-    unused_keys: ClassVar[Mapping[str, str]] = _UNUSED
     state_names = ("steps", "constraints")
 
     policy: ExploringPolicy
@@ -87,7 +66,7 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         self._count_steps(0)
 
     @classmethod
-    def build(cls, config: DictConfig, env: EnvBase) -> OffPolicy:
+    def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
         """Build networks, replay buffer, losses and updates.
 
         Raises:
@@ -99,20 +78,22 @@ class OffPolicy(Resumable, Algorithm, Recipe):
         device = torch.device(config.device)
         networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env, device)
-        loss = build_loss(
+        loss = instantiate(
             config.loss,
+            {
+                "qvalue_network": networks.get("critic"),
+                "cost_qvalue_network": networks.get("cost_critic"),
+                "action_spec": bounded_actions(env).to(device),
+                "multiplier": constraints.multiplier,
+                "cost_keys": constraints.keys,
+                "constraints": constraints,
+                "cost_limits": limits,
+            },
             actor_network=networks["actor"],
-            qvalue_network=networks.get("critic"),
-            cost_qvalue_network=networks.get("cost_critic"),
-            action_spec=bounded_actions(env).to(device),
-            multiplier=constraints.multiplier,
-            cost_keys=constraints.keys,
-            constraints=constraints,
-            cost_limits=limits,
         )
-        update = build_update(config.policy_update, ReplayUpdate, loss=loss)
+        update = instantiate(config.policy_update, loss=loss)
         _check_loss(config, constraints, loss)
-        buffer: Memory = build_part(
+        buffer = instantiate(
             config.memory,
             in_keys=loss.in_keys,
             reward_keys=["reward", *constraints.keys],

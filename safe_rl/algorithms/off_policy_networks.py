@@ -10,9 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.build_part import build_part
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
+from safe_rl.trust import instantiate
 
 _ON_POLICY_ONLY = ("_target_", "encoders", "memory", "normalise")
 
@@ -67,7 +67,7 @@ def build_networks(
         "device": device,
     }
     bounds = {"low": spec.low, "high": spec.high}
-    networks = {"actor": build_part(config.actor, observation_size=size, **bounds, **common)}
+    networks = {"actor": instantiate(config.actor, observation_size=size, **bounds, **common)}
     if number := config.critics.rewards:
         networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
     if num_costs and (number := config.critics.costs):

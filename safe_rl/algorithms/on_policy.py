@@ -1,11 +1,11 @@
-"""The on-policy recipe: for every batch advantages, constraints, policy update, critic update."""
+"""On-policy algorithms: for every batch advantages, constraints, policy update, critic update."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import torch
 from omegaconf import DictConfig
@@ -17,17 +17,10 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import (
     Algorithm,
     PolicyUpdate,
-    Recipe,
     SequentialUpdates,
     Stateful,
 )
-from safe_rl.algorithms.build_part import (
-    build_constraints,
-    build_loss,
-    build_part,
-    build_update,
-    constrained_limits,
-)
+from safe_rl.algorithms.build_part import build_constraints, constrained_limits
 from safe_rl.algorithms.constraints import CHARGES, Constraints
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
@@ -36,12 +29,12 @@ from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.targets import TargetError
+from safe_rl.trust import TargetError, instantiate
 
 
 @dataclass
-class OnPolicy(Algorithm, Recipe):
-    """PPO, TRPO, CPO and similar algorithms: the algorithm, and the recipe that builds it.
+class OnPolicy(Algorithm):
+    """PPO, TRPO, CPO and similar algorithms.
 
     Attributes:
         actor: Policy with ``get_dist``.
@@ -72,7 +65,7 @@ class OnPolicy(Algorithm, Recipe):
             self.cost_networks = ["cost_critic"]
 
     @classmethod
-    def build(cls, config: DictConfig, env: EnvBase) -> OnPolicy:
+    def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
         """Build networks, estimators, losses and updates.
 
         Args:
@@ -86,31 +79,26 @@ class OnPolicy(Algorithm, Recipe):
         limits = _limits(config, env)
         device = torch.device(config.device)
         networks = _build_networks(config, env, len(limits), device)
-        constraints = build_constraints(config, limits, env, device)
-        parts = {
-            "actor_network": networks["actor"],
-            "constraints": constraints,
-            "multiplier": constraints.multiplier,
-            "cost_keys": constraints.keys,
-            "cost_limits": constraints.held_limits,
-        }
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
+        constraints = build_constraints(config, limits, env, device)
         cost_advantage = None
         if limits:
-            cost_advantage = build_part(config.cost_advantage, value_network=cost_critic, **parts)
+            cost_advantage = instantiate(
+                config.cost_advantage,
+                {"cost_limits": constraints.held_limits},
+                value_network=cost_critic,
+                cost_keys=constraints.keys,
+            )
             constraints.cost_advantage = cost_advantage.tensor_keys.advantage
             if constraints.risk is not None:
                 cost_advantage.set_keys(reward=[CHARGES])
-        policy_update = _build_update(config, critic_network=critic, **parts)
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
-            advantage=build_part(config.advantage, value_network=critic, **parts),
+            advantage=instantiate(config.advantage, value_network=critic),
             cost_advantage=cost_advantage,
-            policy_update=policy_update,
-            critic_update=build_update(
-                config.critic_update, PolicyUpdate, loss=CriticLoss(critic, cost_critic)
-            ),
+            policy_update=_policy_update(config, networks, constraints),
+            critic_update=instantiate(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 
     @classmethod
@@ -198,26 +186,29 @@ def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
     return limits
 
 
-def _build_update(config: DictConfig, **parts: Any) -> PolicyUpdate:
+def _policy_update(
+    config: DictConfig, networks: Mapping[str, Any], constraints: Constraints
+) -> PolicyUpdate:
     """The update of the policy: ``policy_update`` on ``loss``, then the pairs in ``then``."""
-    loss = build_loss(config.loss, **parts)
-    others = {name: part for name, part in parts.items() if name != "actor_network"}
-    update = build_update(config.policy_update, PolicyUpdate, loss=loss, **others)
+    optional = {  # what a loss or an update of a user may take as well
+        "critic_network": networks["critic"],
+        "constraints": constraints,
+        "multiplier": constraints.multiplier,
+        "cost_keys": constraints.keys,
+        "cost_limits": constraints.held_limits,
+    }
+    loss = instantiate(config.loss, optional, actor_network=networks["actor"])
+    update = instantiate(config.policy_update, optional, loss=loss)
     then = config.get("then") or {}
-    for name, pair in then.items():
-        if set(pair) != {"loss", "policy_update"}:
-            raise ValueError(
-                f"then.{name} holds {sorted(pair)}: it needs a loss and a policy_update."
-            )
-    built = {str(name): _build_update(pair, **parts) for name, pair in then.items()}
-    return SequentialUpdates(update, built) if built else update
+    others = {str(name): _policy_update(pair, networks, constraints) for name, pair in then.items()}
+    return SequentialUpdates(update, others) if others else update
 
 
 def _build_networks(
     config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
 ) -> dict[str, Any]:
     """Networks of the node ``model``, by name; a ``_target_`` builds networks of the user's own."""
-    objects = {
+    given = {
         "observation_spec": env.observation_spec,
         "action_spec": env.action_spec,
         "layout": env.observation_layout,
@@ -225,8 +216,8 @@ def _build_networks(
         "device": device,
     }
     if (target := config.model.get("_target_")) is None:
-        return build_networks(config.model, **objects)
-    networks = build_part(config.model, **objects)
+        return build_networks(config.model, **given)
+    networks = instantiate(config.model, given)
     needed = ["actor", "critic", *(["cost_critic"] if num_costs else [])]
     missing = set(needed).difference(networks if isinstance(networks, dict) else ())
     if missing:

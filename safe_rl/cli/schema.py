@@ -233,12 +233,9 @@ def unknown_key(key: str, values: Mapping[str, Any]) -> str:
 
 def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
     """Keys and choices (``key=choice``) that a run's algorithm does not read -> the reasons."""
-    from safe_rl.algorithms.build_part import find_recipe  # with torch: not for help and --cfg
-
     algo = values.get("algo") or {}
-    recipe = find_recipe(OmegaConf.create({"algo": algo}))
-    if not recipe.__module__.startswith("safe_rl."):
-        return recipe.unused_keys
+    if not str(algo.get("_target_", "safe_rl.")).startswith("safe_rl."):
+        return {}
     has_multiplier = any(
         "multiplier" in (part.names or ()) or not str(node["_target_"]).startswith("safe_rl.")
         for path, node, part in _nodes(values)
@@ -247,7 +244,7 @@ def unread_by(values: Mapping[str, Any]) -> Mapping[str, str]:
     idle = {} if has_multiplier else {"lagrangian": "Its loss has no multiplier."}
     if algo.get("constrained") is False:
         idle |= dict.fromkeys(("limits", "cost_advantage"), "It keeps no limits.")
-    return {**idle, **recipe.unused_keys}
+    return idle
 
 
 def _nearest_keys(key: str, known: list[str]) -> list[str]:

@@ -14,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.cli.grammar import CommandLineError, overrides_of
 
 _imported: list[str] = []
@@ -55,7 +55,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
             raise CommandLineError(
                 f"import={module}: Python has another module of that name, {found}. Rename yours."
             )
-        targets.allow(name)
+        trust.allow(name)
         where = module if name == module else str(path.resolve())
         if where not in _imported:
             _imported.append(where)
@@ -87,7 +87,7 @@ def _import(name: str, given: str) -> str:
 
 def _is_inner(file: str) -> bool:
     """Whether code is of this package or of Python's import."""
-    return file.startswith(str(Path(targets.__file__).parent)) or "importlib" in file
+    return file.startswith(str(Path(trust.__file__).parent)) or "importlib" in file
 
 
 def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **options: Any) -> Any:

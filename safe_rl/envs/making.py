@@ -25,7 +25,7 @@ from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
 from safe_rl.envs.velocity.velocity_config import VelocityConfig
 from safe_rl.naming import did_you_mean
-from safe_rl.targets import locate
+from safe_rl.trust import locate
 
 
 def make_env(

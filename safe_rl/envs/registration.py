@@ -19,7 +19,7 @@ from safe_rl.envs.families import GROUP, VELOCITY_TARGET, config_node, env_names
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, VelocityConfig
-from safe_rl.targets import allow
+from safe_rl.trust import allow
 
 SCHEME = "safe-rl-environments"
 

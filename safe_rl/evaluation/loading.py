@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
@@ -103,7 +103,7 @@ def load_policy(
         CheckpointError: If the file is no checkpoint, its policy does not fit the environment, or
             has weights that are not finite.
     """
-    policy, networks = find_recipe(config).build_policy(config, env, device)
+    policy, networks = find_algorithm(config).build_policy(config, env, device)
     try:
         CheckpointStore.load(checkpoint, networks)
     except CheckpointError as error:

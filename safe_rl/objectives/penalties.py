@@ -67,7 +67,7 @@ class P3OLoss(PenaltyLoss):
         >>> from safe_rl.models import make_actor
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> constraints = Constraints({"cost": 25.0})
-        >>> constraints.violation.fill_(10.0)  # a recipe's constraints observe their episodes
+        >>> constraints.violation.fill_(10.0)  # in a run they observe their episodes
         tensor([10.])
         >>> constraints.episode_length.fill_(100.0)
         tensor(100.)

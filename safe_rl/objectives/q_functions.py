@@ -48,7 +48,7 @@ Distance = Literal["l2", "smooth_l1", "l1"]
 
 
 class ReplayLoss(Checked, SharesTensors):
-    """Interface of losses on steps from a replay buffer, for the off-policy recipe and its update.
+    """Interface of losses on steps from a replay buffer, for off-policy algorithms.
 
     Attributes:
         risk_measure: Class of risk measure that the cost critics estimate; None for means only.

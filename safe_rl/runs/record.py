@@ -19,7 +19,7 @@ from safe_rl.runs.folder import RunFolder, lock_folder
 from safe_rl.runs.identity import given_settings
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.table import TableWriter, read_table
-from safe_rl.targets import build
+from safe_rl.trust import instantiate
 
 
 class RunRecord:
@@ -79,7 +79,7 @@ class RunRecord:
                 self._save_config()
             table = TableWriter(self.folder.table, keep_rows=epoch or 0)
             self._table = opened.enter_context(table)
-            self._logger = build(self._config.get("logger"), log_dir=str(self.directory))
+            self._logger = instantiate(self._config.get("logger"), log_dir=str(self.directory))
             if self._logger is not None:
                 opened.callback(self._logger.close)
                 if epoch is not None:

@@ -19,7 +19,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
@@ -27,8 +27,8 @@ from safe_rl.files import read_config
 from safe_rl.runs.checkpoints import read_states
 from safe_rl.runs.folder import RunFolder, run_of
 from safe_rl.runs.record import RunRecord
-from safe_rl.targets import build
 from safe_rl.training.trainer import Evaluator, Trainer
+from safe_rl.trust import instantiate
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes the periodic evaluation of a policy that is trained."""
@@ -72,7 +72,7 @@ def build_trainer(
         ValueError: If parts of the configuration do not fit together.
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    algorithm = find_recipe(config).build(config, env)
+    algorithm = find_algorithm(config).from_config(config, env)
     record = RunRecord(directory, config, cost_limits, env.max_episode_steps)
     recording = Recording(record.folder.transitions, env.cost_keys)
     return Trainer(
@@ -94,7 +94,7 @@ def _build_collector(
     numbers = {"frames_per_batch": _decisions_per_batch(config, env), "device": config.device}
     if config.collector.get("_target_") is None:
         return make_collector(env, policy, **numbers)
-    return build(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
+    return instantiate(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
 
 
 def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:

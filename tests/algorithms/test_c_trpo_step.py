@@ -175,6 +175,6 @@ def test_the_limit_of_a_share_of_episodes_is_what_recoveries_go_by():
     for risk in ("risk=chance", "risk=mean"):
         given = ("algo=c_trpo", "cost_limits={cost: 25}", risk)
         config = point_mass_config(*given, minibatch_size=None)
-        step = OnPolicy.build(config, PointMass(config.num_envs)).policy_update
+        step = OnPolicy.from_config(config, PointMass(config.num_envs)).policy_update
         ends.append(step.recovered.item())
     assert ends == pytest.approx([-0.2 * 25.0 * 0.1, -0.2 * 25.0])

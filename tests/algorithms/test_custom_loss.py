@@ -9,11 +9,11 @@ from point_mass_runs import point_mass_trainer
 from run_configs import CONF
 from tensordict import TensorDict
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.algorithms import Constraints
 from safe_rl.models import make_actor
 from safe_rl.runs.table import read_table
-from safe_rl.targets import allow
+from safe_rl.trust import allow
 
 EXAMPLES = CONF.parent / "examples"
 allow("custom_loss")
@@ -61,7 +61,7 @@ def test_it_trains_with_several_costs(tmp_path, algo):
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])
 def test_a_run_learns_with_a_loss_of_torchrls(name, tmp_path, monkeypatch):
     """What is not one number for each of its constraints is logged as a scalar."""
-    monkeypatch.setitem(targets._ROOMS, "torchrl.objectives", None)
+    monkeypatch.setitem(trust._ROOMS, "torchrl.objectives", None)
     keys = ("algo=ppo", f"loss._target_=torchrl.objectives.{name}")
     with pytest.raises(ValueError, match="this one reports none: use max_kl=null and adapt"):
         point_mass_trainer(tmp_path / "kl", *keys).run()

@@ -21,7 +21,7 @@ from safe_rl.objectives import (
     PPOLagrangianLoss,
     VectorGAE,
 )
-from safe_rl.targets import allow
+from safe_rl.trust import allow
 
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
 TRACKER = {
@@ -143,5 +143,5 @@ class CostsElsewhere(CostGAE):
 def test_a_recipe_weighs_cost_advantages_where_its_estimator_writes_them():
     allow(__name__)
     config = point_mass_config(f"cost_advantage._target_={__name__}.CostsElsewhere")
-    algorithm = OnPolicy.build(config, PointMass(4))
+    algorithm = OnPolicy.from_config(config, PointMass(4))
     assert algorithm.constraints.cost_advantage == ("costs", "advantage")

@@ -5,7 +5,7 @@ import torch
 from point_mass_runs import point_mass_trainer
 
 from safe_rl.models import make_actor, make_critic
-from safe_rl.targets import TargetError, allow
+from safe_rl.trust import TargetError, allow
 
 TARGET = f"+model._target_={__name__}"
 

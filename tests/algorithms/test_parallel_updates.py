@@ -10,7 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from safe_rl.algorithms import on_policy
 from safe_rl.algorithms.processor_use import in_parallel, torch_threads
 from safe_rl.objectives import PPOLoss
-from safe_rl.targets import allow
+from safe_rl.trust import allow
 
 allow(__name__)
 

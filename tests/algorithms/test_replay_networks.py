@@ -28,7 +28,7 @@ class Acting(PointMass):
 )
 def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
-        OffPolicy.build(off_policy_config("algo=sac"), Acting(spec))
+        OffPolicy.from_config(off_policy_config("algo=sac"), Acting(spec))
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_other_observations_than_a_vector_are_refused(observation, message):
     env = PointMass(2)
     env.observation_spec = Composite(observation=observation, shape=[2])
     with pytest.raises(ValueError, match=message):
-        OffPolicy.build(off_policy_config("algo=sac"), env)
+        OffPolicy.from_config(off_policy_config("algo=sac"), env)
 
 
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])

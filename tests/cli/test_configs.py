@@ -11,7 +11,7 @@ from point_mass import PointMass
 from run_configs import CONF, compose_config
 
 from safe_rl.algorithms import OffPolicy, OnPolicy
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
 from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, registration
@@ -58,9 +58,9 @@ def test_every_combination_resolves_and_builds(env, algo, preset):
     OmegaConf.update(config, "env", {"name": "PointMass", "robot_base": "point"}, merge=False)
     if config.get("dataset", {}).get("alone"):
         with pytest.raises(ValueError, match=r"dataset\.path is missing"):
-            find_recipe(config).build(config, PointMass(2))
+            find_algorithm(config).from_config(config, PointMass(2))
         return
-    algorithm = find_recipe(config).build(config, PointMass(2))
+    algorithm = find_algorithm(config).from_config(config, PointMass(2))
     assert ("cost_critic" in algorithm.networks) == bool(algorithm.cost_keys)
     assert (algorithm.constraints.multiplier is not None) == (algo in LAGRANGIAN)
 
@@ -71,7 +71,7 @@ def test_multipliers_are_interchangeable(algo, multiplier):
     names = (f"algo={algo}", f"lagrangian={multiplier}")
     config = compose_config("env=PointMass", *names)
     assert config.lagrangian == OmegaConf.load(CONF / "lagrangian" / f"{multiplier}.yaml")
-    find_recipe(config).build(config, PointMass(2))
+    find_algorithm(config).from_config(config, PointMass(2))
 
 
 def test_every_environment_is_an_option_and_a_node_with_all_keys():
@@ -103,7 +103,7 @@ def test_hydra_makes_no_node_that_nobody_asked_for(monkeypatch, capsys):
 
 def test_learning_rates_are_given_by_the_names_of_parameters():
     config = compose_config("env=PointMass", "algo=sac", "policy_update.rates={log_alpha: 1e-4}")
-    update = find_recipe(config).build(config, PointMass(2)).policy_update
+    update = find_algorithm(config).from_config(config, PointMass(2)).policy_update
     rates = {len(group["params"]): group["lr"] for group in update.optimizer.param_groups}
     assert rates[1] == 1e-4
     assert max(rates.values()) == config.policy_update.optimizer.lr
@@ -244,7 +244,7 @@ def test_the_paper_preset_is_the_paper(env, algo):
 
 def test_the_paper_has_no_algorithm_that_learns_from_memory():
     others = set(ALGORITHMS) - set(PAPER)
-    assert all(find_recipe(compose_config(f"algo={name}")) is OffPolicy for name in others)
+    assert all(find_algorithm(compose_config(f"algo={name}")) is OffPolicy for name in others)
     # of what all share they have their own numbers
     assert compose_config("algo=sac").frames_per_batch == 5_000
     assert compose_config("algo=ppo").frames_per_batch == 20_000
@@ -281,7 +281,7 @@ def test_cost_limits_must_name_costs_of_the_environment():
         with pytest.raises(ValueError, match="'cost' is"):
             check_cost_limits({"cost": limit}, keys)
     with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
-        OnPolicy.build(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
+        OnPolicy.from_config(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
 
 
 def test_the_compile_switch_reaches_both_updates():
@@ -295,12 +295,12 @@ def test_hyper_parameters_have_one_home():
     config = compose_config("env=PointMass")
     del config.policy_update.num_passes
     with pytest.raises(Exception, match="num_passes"):
-        OnPolicy.build(config, PointMass(2))
+        OnPolicy.from_config(config, PointMass(2))
 
 
 def test_networks_scale_the_components_that_are_observed():
     config = compose_config("env=PointMass", "model.input_scale={velocity: 0.5}")
-    network = OnPolicy.build(config, PointMass(2)).actor
+    network = OnPolicy.from_config(config, PointMass(2)).actor
     scales = [value for name, value in network.state_dict().items() if name.endswith("0.scale")]
     torch.testing.assert_close(scales, [torch.tensor([1.0, 1.0, 0.5, 0.5])])
 

@@ -12,7 +12,7 @@ from point_mass import PointMass
 from run_configs import CONF, compose_config
 
 import safe_rl.objectives
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.cli.schema import KEYS, check_settings, plain
 from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
@@ -104,7 +104,7 @@ def outcome(config: Any, path: str, value: Any) -> str:
     except ValueError as error:
         return str(error)
     try:
-        find_recipe(changed).build(changed, PointMass(2))
+        find_algorithm(changed).from_config(changed, PointMass(2))
     except SETTING_ERRORS as error:  # what parts have to say about two keys together
         return " ".join(str(error).split())
     return ""
@@ -209,7 +209,7 @@ class OwnLoss(safe_rl.objectives.PPOLagrangianLoss):
 
 
 def test_parts_of_ones_own_are_checked_by_what_they_inherit(monkeypatch):
-    monkeypatch.setitem(safe_rl.targets._ROOMS, __name__, None)
+    monkeypatch.setitem(safe_rl.trust._ROOMS, __name__, None)
     config = config_of("ppo_lagrangian").copy()
     config.lagrangian._target_ = f"{__name__}.OwnMultiplier"
     config.loss._target_ = f"{__name__}.OwnLoss"

@@ -135,56 +135,6 @@ def test_a_risk_measure_is_refused_where_no_limit_is_kept():
             read_command(words)
 
 
-UNREAD = {
-    "advantage.gamma=0.9": r"algo=td3 does not read 'advantage'\. .*the discount is loss\.gamma",
-    "critic_update.optimizer.lr=1e-4": "'critic_update'. Its Q functions are trained together with",
-    "+critic_update.max_grad_norm=1": "does not read 'critic_update'",
-    "+cost_advantage.gamma=0.9": "does not read 'cost_advantage'",
-    "+then.again.loss._target_=safe_rl.objectives.PPOLoss": "'then'. It has one update",
-    "model.head=tanh": "'model.head'. The distribution of its actions is the algorithm's own",
-    "model.initial_log_std=-1": "Its network gives the standard deviation",
-    "model.normalise=10": r"'model\.normalise'\. Fixed factors, model\.input_scale, scale",
-}
-
-
-@pytest.mark.parametrize("argument", UNREAD)
-def test_what_only_other_algorithms_read_is_refused_with_the_reason(argument):
-    with pytest.raises(CommandLineError, match=UNREAD[argument]):
-        read_command(["algo=td3", argument])
-    if "+" not in argument:
-        read_command(["algo=ppo", argument])
-        with pytest.raises(CommandLineError, match="algo=sac does not"):
-            read_command(["-m", "algo=ppo,sac", argument])
-        with pytest.raises(CommandLineError, match=f"'{argument}': algo=bc does not read"):
-            read_command(["algo=bc", argument])
-
-
-MEANT = {
-    ("sac", "lr=1e-3"): "policy_update.optimizer.lr",
-    ("sac", "+lr=1e-3"): "policy_update.optimizer.lr",
-    ("sac", "gamma=0.9"): "loss.gamma",
-    ("cpo", "policy_update.max_kl=0.1"): "policy_update.target_kl",
-    ("cpo", "target_kl=0.1"): "policy_update.target_kl",
-}
-
-
-@pytest.mark.parametrize(("algo", "argument"), MEANT)
-def test_only_keys_that_the_algorithm_reads_are_proposed(algo, argument):
-    with pytest.raises(CommandLineError) as caught:
-        read_command([f"algo={algo}", argument])
-    assert str(caught.value).endswith(f" Did you mean '{MEANT[algo, argument]}'?")
-
-
-def test_the_paper_s_setting_is_refused_where_the_paper_has_none():
-    read_command(["algo=cpo", "preset=paper"])
-    read_command(["-m", "algo=cpo,sac", "preset=default"])
-    for choices in (["algo=sac"], ["algo=bc"], ["-m", "algo=cpo,sac"]):
-        with pytest.raises(CommandLineError, match=r"has no 'preset=paper'\. It is the setting of"):
-            read_command([*choices, "preset=paper"])
-    with pytest.raises(CommandLineError, match="algo=sac has no 'preset=paper'"):
-        read_command(["-m", "algo=sac", "preset=default,paper"])
-
-
 # files of one's own, each with what the line about it must name: the file, and the key or the place
 FAULTY = {
     "defaults: [ppo, {override /lagrangian: pid}]": r"algo/mine': .*override 'lagrangian'",

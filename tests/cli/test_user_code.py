@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import point_mass_config
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.cli import user_code
 from safe_rl.cli.composing import compose_resumed
 from safe_rl.cli.grammar import CommandLineError, split_imports
@@ -31,7 +31,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(user_code, "_imported", [])
-    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
+    monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     before = set(sys.modules)
     yield tmp_path
     for name in set(sys.modules) - before:
@@ -60,7 +60,7 @@ def test_modules_are_found_by_name_and_by_file(folder):
     (folder / "below" / "users_second.py").write_text(MODULE)
     import_modules(["users_first", "below/users_second.py"])
     for name in ("users_first", "users_second"):
-        assert targets.locate(f"{name}.Loss") is sys.modules[name].Loss
+        assert trust.locate(f"{name}.Loss") is sys.modules[name].Loss
     # as other processes find them, whatever their current folder
     assert user_code.imported() == ["users_first", str(folder / "below" / "users_second.py")]
 
@@ -108,7 +108,7 @@ def test_opening_a_run_imports_nothing(folder):
     with pytest.raises(CommandLineError, match=r"trained with import=users_own: add that"):
         compose_resumed(folder / "run", [])
     config = OmegaConf.load(path)
-    with pytest.raises(targets.TargetError, match=r"^loss\._target_=users_own\.Loss.*import=users"):
+    with pytest.raises(trust.TargetError, match=r"^loss\._target_=users_own\.Loss.*import=users"):
         build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
     assert not (folder / "users_own.trace").exists()
     for given in ([], ["users_own"], ["moved_since.py"], ["/home/o'brien/moved.py"]):
@@ -150,7 +150,7 @@ def make_without_costs(config, **kind):
 
 
 def test_what_an_environment_of_ones_own_lacks_is_said(folder):
-    targets.allow(__name__)
+    trust.allow(__name__)
     node = {"_target_": f"{__name__}.make_without_costs", "name": "mine"}
     with pytest.raises(SETTING_ERRORS) as error:
         make_env(node, num_envs=2)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import pytest
 from registrations import undone
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.cli import user_code
 from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.grammar import parse_options, split_imports
@@ -82,7 +82,7 @@ def workplace(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(user_code, "_imported", [])
-    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
+    monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     with undone():
         yield tmp_path
     for name, module in list(sys.modules.items()):

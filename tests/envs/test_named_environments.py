@@ -7,10 +7,10 @@ import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 from hydra.core.config_store import ConfigStore
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.envs import ConfigError, ContractError, make_env, store_config
 from safe_rl.envs.velocity import VelocityEnv
-from safe_rl.targets import TargetError
+from safe_rl.trust import TargetError
 
 
 @pytest.fixture(autouse=True)
@@ -18,7 +18,7 @@ def _as_before(monkeypatch):
     """What a test stores and allows is gone afterwards."""
     group = ConfigStore.instance().repo.setdefault("env", {})
     before = dict(group)
-    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
+    monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     yield
     group.clear()
     group.update(before)

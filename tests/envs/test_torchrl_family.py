@@ -11,13 +11,13 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.cli import evaluate, report
 from safe_rl.envs import ConfigError, complete_env, make_env
 from safe_rl.envs.families import TORCHRL_CLASSES
 from safe_rl.envs.torchrl.step_entries import Observe
 from safe_rl.runs.table import read_table
-from safe_rl.targets import TargetError
+from safe_rl.trust import TargetError
 
 TARGET = "safe_rl.envs.torchrl.make_torchrl"
 OUTSIDE = {"cost_speed": ["thdot", -4, 4]}
@@ -33,7 +33,7 @@ SMALL = (
 @pytest.fixture
 def trusted(monkeypatch):
     """As after `import=torchrl_envs`."""
-    monkeypatch.setitem(targets._ROOMS, "torchrl_envs", None)
+    monkeypatch.setitem(trust._ROOMS, "torchrl_envs", None)
 
 
 def test_it_resumes_is_evaluated_and_reported(tmp_path, capsys):

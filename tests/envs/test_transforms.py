@@ -20,7 +20,7 @@ from safe_rl.envs.transforms import (
     Saute,
     SensorNoise,
 )
-from safe_rl.targets import TargetError, allow
+from safe_rl.trust import TargetError, allow
 
 allow("transforming")
 

@@ -90,7 +90,7 @@ def test_without_a_weight_the_projection_stays_where_the_first_step_has_led():
 def test_the_first_step_of_a_run_knows_no_costs():
     """Also where a multiplier is at hand."""
     overrides = ("algo=cup", "cost_limits={cost_north: 1}")
-    algorithm = OnPolicy.build(point_mass_config(*overrides), PointMass(2))
+    algorithm = OnPolicy.from_config(point_mass_config(*overrides), PointMass(2))
     first, projection = (
         update.loss
         for update in (algorithm.policy_update.first, algorithm.policy_update.then["projection"])

@@ -8,8 +8,8 @@ from run_configs import point_mass_config
 
 from safe_rl.runs.loggers import ResumableLogger, WandbLogger
 from safe_rl.runs.table import read_table
-from safe_rl.targets import allow
 from safe_rl.training.building import build_trainer, seed_everything
+from safe_rl.trust import allow
 
 
 def train(directory, *overrides):

@@ -7,7 +7,7 @@ from run_configs import assert_resumes_exactly
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import A2CLoss, ClipPPOLoss, KLPENPPOLoss
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.algorithms.losses import LossState
 from safe_rl.models import make_actor
 from safe_rl.objectives import PPOLagrangianLoss, TRPOLagrangianLoss
@@ -43,7 +43,7 @@ class RememberingTRPO(_Remembering, TRPOLagrangianLoss):
 
 @pytest.fixture(autouse=True)
 def _allowed(monkeypatch):
-    monkeypatch.setitem(targets._ROOMS, __name__, None)
+    monkeypatch.setitem(trust._ROOMS, __name__, None)
 
 
 def _trainer(folder, algo, loss, frames, *overrides):

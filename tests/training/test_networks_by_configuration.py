@@ -9,7 +9,7 @@ from commands import run_train
 from point_mass import PointMass  # noqa: F401
 from run_configs import compose_config, without_times
 
-from safe_rl.algorithms.build_part import find_recipe
+from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.cli import evaluate
 from safe_rl.collectors import read_dataset
 from safe_rl.envs import make_env
@@ -78,7 +78,7 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
 def test_off_policy_algorithms_take_perceptrons_alone(choice):
     config = compose_config("algo=sac", "env=PointGoal1", choice)
     with pytest.raises(ValueError, match=r"algo=sac.*model\.\w+ is for on-policy algorithms"):
-        find_recipe(config).build(config, make_env("PointGoal1", num_envs=2, seed=0))
+        find_algorithm(config).from_config(config, make_env("PointGoal1", num_envs=2, seed=0))
 
 
 @pytest.mark.slow

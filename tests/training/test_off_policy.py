@@ -14,8 +14,8 @@ from safe_rl.evaluation.episodes import collect_episodes, periodic_evaluation
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.objectives import SACLagrangianLoss
 from safe_rl.runs.table import read_table
-from safe_rl.targets import allow
 from safe_rl.training.building import begin_from, build_trainer, seed_everything
+from safe_rl.trust import allow
 
 pytestmark = pytest.mark.long
 
@@ -247,11 +247,11 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
 )
 def test_what_could_not_learn_is_refused(overrides, message):
     with pytest.raises(ValueError, match=message):
-        OffPolicy.build(off_policy_config(*overrides), PointMass(2))
+        OffPolicy.from_config(off_policy_config(*overrides), PointMass(2))
 
 
 def test_without_limits_no_critics_of_costs_are_needed():
-    OffPolicy.build(off_policy_config("algo=sac", "critics.costs=0"), PointMass(2))
+    OffPolicy.from_config(off_policy_config("algo=sac", "critics.costs=0"), PointMass(2))
 
 
 def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_trainer):

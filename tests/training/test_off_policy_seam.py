@@ -13,12 +13,12 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import RandomPolicy
 
-from safe_rl.algorithms import Algorithm, Recipe
+from safe_rl.algorithms import Algorithm
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
 from safe_rl.runs.table import read_table
-from safe_rl.targets import allow
 from safe_rl.training.building import begin_from, build_trainer, seed_everything
+from safe_rl.trust import allow
 
 pytestmark = pytest.mark.long
 
@@ -38,7 +38,7 @@ class RandomExploration(TensorDictModuleBase):
         return tensordict
 
 
-class OneStepQ(Algorithm, Recipe):
+class OneStepQ(Algorithm):
     """Fits Q(s, a) to the reward of one step, from a replay buffer."""
 
     cost_keys = ()
@@ -51,7 +51,7 @@ class OneStepQ(Algorithm, Recipe):
         self._buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2000), batch_size=64)
 
     @classmethod
-    def build(cls, config, env):
+    def from_config(cls, config, env):
         return cls(env)
 
     @classmethod

@@ -215,10 +215,10 @@ def test_the_loss_is_the_mean_squared_difference():
 def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path):
     data = record(tmp_path / "data", head_south)
     with pytest.raises(ValueError, match="the replay buffer holds 160 transitions") as error:
-        OffPolicy.build(offline_config(data, "memory.batch_size=512"), PointMass(4))
+        OffPolicy.from_config(offline_config(data, "memory.batch_size=512"), PointMass(4))
     assert "a minibatch of 512 (memory.batch_size)" in str(error.value)
     with pytest.raises(ValueError, match="algo=bc has no TD errors"):
-        OffPolicy.build(offline_config(data, "memory.prioritised={alpha: 1}"), PointMass(4))
+        OffPolicy.from_config(offline_config(data, "memory.prioritised={alpha: 1}"), PointMass(4))
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_numbers_that_are_not_finite_are_refused(algo, key, value, tmp_path):
     Recording(tmp_path / "data", PointMass.cost_keys).write(0, batch)
     name = key if isinstance(key, str) else key[1]
     with pytest.raises(ValueError, match=f"the {name} of 2 transitions is not finite"):
-        OffPolicy.build(
+        OffPolicy.from_config(
             offline_config(tmp_path / "data", limits="{cost: 25}", algo=algo), PointMass(2)
         )
 
@@ -265,7 +265,7 @@ def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):
     limits = "{cost: 0}" if "+limit=0" in overrides else "{cost: 20}"
     config = offline_config(data, *overrides, limits=limits)
     with pytest.raises((ValueError, FileNotFoundError), match=words):
-        OffPolicy.build(config, env())
+        OffPolicy.from_config(config, env())
 
 
 def test_costs_that_a_dataset_lacks_are_named(tmp_path):
@@ -274,6 +274,8 @@ def test_costs_that_a_dataset_lacks_are_named(tmp_path):
     Recording(folder, ["cost"]).write(0, batch)
     limits = "{cost_north: 3}"
     with pytest.raises(ValueError, match="has no cost_north, which cost_limits names"):
-        OffPolicy.build(offline_config(folder, limits=limits), PointMass(2))
+        OffPolicy.from_config(offline_config(folder, limits=limits), PointMass(2))
     with pytest.raises(ValueError, match="has no cost_north, which is learned from"):
-        OffPolicy.build(offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2))
+        OffPolicy.from_config(
+            offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2)
+        )

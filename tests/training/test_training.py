@@ -14,8 +14,8 @@ from safe_rl.objectives import PPOLagrangianLoss
 from safe_rl.runs.checkpoints import CheckpointStore, read_facts, read_states
 from safe_rl.runs.folder import checkpoints_in
 from safe_rl.runs.table import read_table
-from safe_rl.targets import allow
 from safe_rl.training.trainer import Trainer
+from safe_rl.trust import allow
 
 allow("test_training")
 

@@ -18,7 +18,7 @@ from safe_rl.envs.contract import add_columns
 from safe_rl.envs.costs import COST, is_cost, parse_ranges
 from safe_rl.envs.errors import ConfigError
 from safe_rl.naming import did_you_mean
-from safe_rl.targets import locate
+from safe_rl.trust import locate
 
 _OBSERVATION = "observation"
 

@@ -34,7 +34,7 @@ from safe_rl.envs.families import TORCHRL, TORCHRL_CLASSES, complete_foreign
 from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
-from safe_rl.targets import locate
+from safe_rl.trust import locate
 
 MakeEnv = partial[EnvBase]
 _STEP = "episode_step"  # environments may write TorchRL's default, "step_count", themselves

@@ -14,7 +14,7 @@ from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.transforms.base import ConstraintTransform
-from safe_rl.targets import TargetError, build
+from safe_rl.trust import TargetError, instantiate
 
 _STATE = "transforms"
 
@@ -198,7 +198,7 @@ def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
     if isinstance(given, Transform):
         return given
     try:
-        transform = build(given)
+        transform = instantiate(given)
     except TargetError as error:
         raise TargetError(f"transforms.{name}: {error}") from error
     if not isinstance(transform, Transform):

@@ -8,9 +8,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from safe_rl import targets
+from safe_rl import trust
 from safe_rl.algorithms import MinibatchUpdate
-from safe_rl.targets import TargetError, build, locate
+from safe_rl.checks import SettingError
+from safe_rl.trust import TargetError, instantiate, locate
 
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 0.1}
 
@@ -29,7 +30,7 @@ def users(monkeypatch):
         module.__dict__,
     )
     monkeypatch.setitem(sys.modules, "users_module", module)
-    monkeypatch.setattr(targets, "_ROOMS", dict(targets._ROOMS))
+    monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     return module
 
 
@@ -49,7 +50,7 @@ def test_live_objects_are_not_copied_and_nested_nodes_are_built():
             },
         }
     )
-    update = build(node.policy_update, loss=loss)
+    update = instantiate(node.policy_update, loss=loss)
     assert isinstance(update, MinibatchUpdate)
     assert update.loss is loss
     assert update.optimizer.param_groups[0]["params"][0] is network.weight
@@ -57,16 +58,16 @@ def test_live_objects_are_not_copied_and_nested_nodes_are_built():
 
 
 def test_a_null_target_is_nothing_and_a_missing_one_an_error():
-    assert build(None) is None
-    assert build(OmegaConf.create({"logger": {"_target_": None}}).logger) is None
+    assert instantiate(None) is None
+    assert instantiate(OmegaConf.create({"logger": {"_target_": None}}).logger) is None
     with pytest.raises(TargetError, match=r"^loss\._target_ is missing"):
-        build(OmegaConf.create({"loss": {"clip_epsilon": 0.2}}).loss)
+        instantiate(OmegaConf.create({"loss": {"clip_epsilon": 0.2}}).loss)
     with pytest.raises(TargetError, match=r"^_target_ is missing"):
-        build(3)
+        instantiate(3)
 
 
 def test_partial_nodes_wait_for_their_arguments():
-    waiting = build(ADAM)
+    waiting = instantiate(ADAM)
     assert isinstance(waiting, partial)
     assert waiting([torch.nn.Parameter(torch.zeros(1))]).defaults["lr"] == 0.1
 
@@ -77,7 +78,7 @@ def test_partial_nodes_wait_for_their_arguments():
         *("torch.load", "os.system", "builtins.eval", "builtins.exec", "eval", "posix.system"),
         *("subprocess.run", "pickle.loads", "importlib.import_module", "hydra.utils.instantiate"),
         # commands, and what imports modules or writes files
-        *("safe_rl.extras.import_extra", "safe_rl.targets.allow", "safe_rl.cli.train.main"),
+        *("safe_rl.extras.import_extra", "safe_rl.trust.allow", "safe_rl.cli.train.main"),
         *("safe_rl.runs.folder.RunFolder", "safe_rl.reporting.write_report"),
         # by way of what an allowed module has imported
         *("safe_rl.cli.os.system", "safe_rl.collectors.workers.torch.load"),
@@ -104,7 +105,7 @@ def test_nothing_else_is_reached(name):
 
 
 def test_what_the_package_keeps_to_itself_is_reached_where_the_user_names_its_module(monkeypatch):
-    monkeypatch.setitem(targets._ROOMS, "safe_rl.collectors.recording", None)
+    monkeypatch.setitem(trust._ROOMS, "safe_rl.collectors.recording", None)
     assert locate("safe_rl.collectors.recording.Recording").__name__ == "Recording"
     with pytest.raises(
         TargetError, match=r"only make_gymnasium, .*\. Did you mean 'make_gymnasium'"
@@ -132,13 +133,13 @@ def traces(path, name):
     "which", ["outermost", "argument", "list", "deep", "positional", "not recursive"]
 )
 def test_no_node_leaves_a_trace(tmp_path, users, which):
-    targets.allow("users_module")
+    trust.allow("users_module")
     trace = tmp_path / "trace"
     node = traces(trace, "users_module.Loss")[which]
     with pytest.raises(TargetError, match=r"^part\..*_target_="):
-        build(OmegaConf.create({"part": node}).part)
+        instantiate(OmegaConf.create({"part": node}).part)
     with pytest.raises(TargetError, match="_target_="):
-        build(node)
+        instantiate(node)
     assert not trace.exists()
 
 
@@ -146,7 +147,7 @@ def test_a_target_is_checked_after_its_interpolations(tmp_path, monkeypatch):
     monkeypatch.setenv("SAFE_RL_TEST_TARGET", "os.getcwd")
     config = OmegaConf.create({"loss": {"_target_": "${oc.env:SAFE_RL_TEST_TARGET}"}})
     with pytest.raises(TargetError, match=r"loss\._target_=os\.getcwd.*import=os "):
-        build(config.loss)
+        instantiate(config.loss)
 
 
 def test_modules_are_not_imported_to_be_refused(tmp_path, monkeypatch):
@@ -155,15 +156,15 @@ def test_modules_are_not_imported_to_be_refused(tmp_path, monkeypatch):
     )
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(TargetError, match="add import=strange_module to the command"):
-        build({"_target_": "strange_module.Loss"})
+        instantiate({"_target_": "strange_module.Loss"})
     assert not (tmp_path / "trace").exists()
 
 
 def test_modules_named_by_the_user_are_reached_but_not_what_they_borrow(users):
     with pytest.raises(TargetError, match="add import=users_module to the command"):
-        build({"_target_": "users_module.Loss", "weight": 2})
-    targets.allow("users_module")
-    loss = build({"_target_": "users_module.Loss", "weight": 2}, network="n")
+        instantiate({"_target_": "users_module.Loss", "weight": 2})
+    trust.allow("users_module")
+    loss = instantiate({"_target_": "users_module.Loss", "weight": 2}, network="n")
     assert (loss.weight, loss.others) == (2, {"network": "n"})
     for name in ("os.system", "system", "pickle.loads", "NUMBER", "Loss.__init__"):
         with pytest.raises(TargetError):
@@ -184,7 +185,10 @@ def test_errors_name_the_full_key():
             },
         }
     )
-    with pytest.raises(TargetError, match=r"^lagrangian: .*'lrr'"):
-        build(config.lagrangian, cost_limits={"cost": 1.0})
-    with pytest.raises(TargetError, match=r"^policy_update\.adapt_rate: .*lowest"):
-        build(config.policy_update)
+    with pytest.raises(SettingError, match=r"^lagrangian\.lrr: .*Did you mean 'lr'"):
+        instantiate(config.lagrangian, cost_limits={"cost": 1.0})
+    with pytest.raises(SettingError, match=r"^policy_update\.adapt_rate: .*lowest"):
+        instantiate(config.policy_update)
+    config.lagrangian = {"_target_": config.lagrangian._target_, "init": True, "lr": 1.0}
+    with pytest.raises(SettingError, match=r"^lagrangian\.init=true: it must be"):
+        instantiate(config.lagrangian, cost_limits={"cost": 1.0})

@@ -1,4 +1,4 @@
-"""From a configuration's ``_target_`` to an object: the only place that does it.
+"""What configurations may build: from a ``_target_`` to an object, the only place that does it.
 
 A configuration may come with a run of another person. It can therefore name only what runs are
 built of: parts of this package, torch's optimisers, and what modules define that the user has
@@ -8,14 +8,16 @@ named by ``import=``. This is directly in ``safe_rl/``, because all folders buil
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping
 from pkgutil import resolve_name
 from typing import Any, cast
 
+import hydra.utils
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from safe_rl.checks import SettingError, parameters_of
 from safe_rl.naming import did_you_mean, join_keys
 
 # Packages and modules with parts of a run, and those of the user. Names are listed where other
@@ -35,8 +37,8 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
 }
 
 
-class TargetError(ValueError):
-    """A node that cannot be built; the message names its key and what to change."""
+class TargetError(SettingError):
+    """A ``_target_`` that a configuration may not name, or that does not exist."""
 
 
 def allow(module: str) -> None:
@@ -44,29 +46,37 @@ def allow(module: str) -> None:
 
     Examples:
         >>> allow("fractions")
-        >>> build({"_target_": "fractions.Fraction", "numerator": 3}, denominator=4)
+        >>> instantiate({"_target_": "fractions.Fraction", "numerator": 3}, denominator=4)
         Fraction(3, 4)
     """
     _ROOMS[module] = None
 
 
-def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any:
+def instantiate(
+    node: DictConfig | Mapping[str, Any] | None,
+    /,
+    optional: Mapping[str, Any] | None = None,
+    **objects: Any,
+) -> Any:
     """Build what a node's ``_target_`` names, as :func:`hydra.utils.instantiate` does.
 
     Args:
         node: The node. Nodes within it that have a ``_target_`` are built first. A node with
             ``_partial_: true`` becomes a function that takes the remaining arguments later.
+        optional: Arguments that the outermost target gets if its signature has them and they are
+            not None.
         objects: Further arguments of the outermost target. They are passed on without a copy.
 
     Returns:
         The object; None if the node or its ``_target_`` is null.
 
     Raises:
-        TargetError: If a target may not be named, does not exist, or refuses its arguments.
+        TargetError: If a target may not be named or does not exist.
+        SettingError: If a target refuses its arguments; the message names the full key.
 
     Examples:
         >>> node = {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
-        >>> build(node, cost_limits={"cost": 25.0}).value
+        >>> instantiate(node, cost_limits={"cost": 25.0}).value
         tensor([1.])
     """
     key, plain = "", cast(Any, node)
@@ -78,14 +88,30 @@ def build(node: DictConfig | Mapping[str, Any] | None, /, **objects: Any) -> Any
         raise TargetError(f"{join_keys(key, '_target_')} is missing: it names the class to build.")
     if plain["_target_"] is None:
         return None
-    checked = _checked(plain, key)
+    trusted, target = _trusted(plain, key), locate(plain["_target_"])
+    known = parameters_of(target) if optional else {}
+    objects |= {k: v for k, v in (optional or {}).items() if k in known and v is not None}
     try:
-        part = instantiate(checked, _partial_=True)
+        part = hydra.utils.instantiate(trusted, _partial_=True)
         return part if plain.get("_partial_") and not objects else part(**objects)
     except InstantiationException as error:
-        raise TargetError(_in_words(error, key)) from error
-    except (TypeError, ValueError) as error:
-        raise TargetError(f"{key}: {error}" if key else str(error)) from error
+        inner = str(error).partition("full_key: ")[2]
+        place, cause = join_keys(key, inner) if inner else key, error.__cause__ or error
+        raise _in_words(cause, place, target) from error
+    except (TypeError, ValueError, ModuleNotFoundError) as error:
+        raise _in_words(error, key, target) from error
+
+
+def _in_words(error: BaseException, key: str, target: Callable[..., Any]) -> SettingError:
+    """An error of a constructor, with the full key of its node or of the wrong setting."""
+    unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+    if isinstance(error, SettingError):
+        return SettingError(join_keys(key, str(error)))
+    if isinstance(error, TypeError) and unknown:
+        close = did_you_mean(unknown[1], parameters_of(target))
+        name = join_keys(key, unknown[1])
+        return SettingError(f"{name}: {target.__name__} has no such argument.{close}")
+    return SettingError(f"{key}: {error}" if key else str(error))
 
 
 def locate(target: Any, key: str = "") -> Callable[..., Any]:
@@ -100,7 +126,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         >>> locate("torch.load", key="loss._target_")
         Traceback (most recent call last):
         ...
-        safe_rl.targets.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
+        safe_rl.trust.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command.
     """  # noqa: E501
     name = " ".join(str(target).split())  # in one line, as messages show it
     shown = f"{key}={name}" if key else name
@@ -142,21 +168,13 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     return found
 
 
-def _checked(node: Any, key: str) -> Any:
+def _trusted(node: Any, key: str) -> Any:
     """Copy plain containers after checking that every target in them is allowed."""
     if isinstance(node, list | tuple | ListConfig):
-        return [_checked(item, f"{key}[{index}]") for index, item in enumerate(node)]
+        return [_trusted(item, f"{key}[{index}]") for index, item in enumerate(node)]
     if not isinstance(node, Mapping):
         return node
-    copied = {name: _checked(value, join_keys(key, name)) for name, value in node.items()}
+    copied = {name: _trusted(value, join_keys(key, name)) for name, value in node.items()}
     if "_target_" in copied:
         locate(copied["_target_"], join_keys(key, "_target_"))
     return copied
-
-
-def _in_words(error: InstantiationException, key: str) -> str:
-    """The full key of a node, and the message of the error that its target raised."""
-    cause = error.__cause__
-    inner = str(error).partition("full_key: ")[2]
-    words = str(cause) if isinstance(cause, ValueError) else f"{type(cause).__name__}: {cause}"
-    return f"{join_keys(key, inner) if inner else key}: {words if cause is not None else error}"
