@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, OneHot
+from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.envs.costs import COST
@@ -61,6 +61,14 @@ class ConstrainedEnv(EnvBase):
     steps_before: int = 0
     first_steps: Tensor | None = None
     render: Any = None
+
+    @property
+    def action_bounds(self) -> tuple[Tensor, Tensor] | None:
+        """Lowest and highest action [A] in the environment's own units; None for choices.
+
+        The action spec has other bounds where actions are rescaled on their way (`env=gymnasium`).
+        """
+        return bounds_of(self.action_spec_unbatched)
 
     def get_state(self) -> Any:
         """Return a copy of everything that determines what happens next, a TensorDict [N].
@@ -137,6 +145,13 @@ class ConstrainedEnv(EnvBase):
         self.steps_before = steps
 
 
+def bounds_of(spec: TensorSpec) -> tuple[Tensor, Tensor] | None:
+    """Return the bounds of continuous actions, float32 on the CPU; None for choices."""
+    if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point:
+        return None
+    return spec.low.float().cpu(), spec.high.float().cpu()
+
+
 def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[str, slice]:
     """Return a layout with further components, of given sizes, after its last column.
 
@@ -153,6 +168,7 @@ def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[s
 _DEFAULTS = (
     *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "first_steps"),
     *("render", "get_state", "add_steps", "get_positions", "continue_from", "highest_cost"),
+    "action_bounds",
 )
 
 

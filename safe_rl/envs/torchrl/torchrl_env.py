@@ -27,7 +27,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.transforms import Transform
 
-from safe_rl.envs.contract import ConstrainedEnv
+from safe_rl.envs.contract import ConstrainedEnv, bounds_of
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import TORCHRL, TORCHRL_CLASSES, complete_foreign
@@ -63,6 +63,11 @@ class TorchRLEnv(ConstrainedEnv, TransformedEnv):
         self.cost_keys = costs.names
         self.observation_layout = observe.layout
         self.max_episode_steps = int(config["num_steps"])
+
+    @property
+    def action_bounds(self) -> tuple[Tensor, Tensor] | None:
+        """Bounds of the environment itself, to which actions in [-1, 1] are scaled."""
+        return bounds_of(self.base_env.action_spec_unbatched)
 
 
 def make_torchrl(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 
@@ -56,6 +57,11 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     def render(self) -> Any:
         """The inner environment's method that draws it; None if it draws no pictures."""
         return self.base_env.render
+
+    @property
+    def action_bounds(self) -> tuple[Tensor, Tensor] | None:
+        """Bounds of the inner environment's own units."""
+        return self.base_env.action_bounds
 
     @property
     def steps_per_decision(self) -> int:
