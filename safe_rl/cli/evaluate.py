@@ -41,15 +41,20 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
     from safe_rl.cli.evaluating import certify_run
 
-    read = {name: getattr(options, name) for name in ("certify", "certificate", "num_threads")}
+    names = ("certify", "certificate", "deterministic", "num_threads")
+    read = {name: getattr(options, name) for name in names}
     for name, value in vars(EvaluationOptions(**read)).items():
         if getattr(options, name) != value:
             raise CommandLineError(
                 f"{name}: it is ignored by certify=true. A certificate is about the run's own "
-                "environment. Its options are certificate.episodes=… and so on, and num_threads=…"
+                "environment. Its options are certificate.episodes=… and so on, "
+                "deterministic=true and num_threads=…"
             )
     certificate = certify_run(
-        directory, num_threads=options.num_threads, changes=options.certificate
+        directory,
+        num_threads=options.num_threads,
+        changes=options.certificate,
+        deterministic=options.deterministic,
     )
     print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
     return 0 if certificate is not None and certificate.checkpoint is not None else 1

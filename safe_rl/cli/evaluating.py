@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,15 @@ def evaluate_run(
 
 
 def certify_run(
-    directory: Path, *, num_threads: int = 0, changes: Mapping[str, Any] | None = None
+    directory: Path,
+    *,
+    num_threads: int = 0,
+    changes: Mapping[str, Any] | None = None,
+    deterministic: bool = False,
 ) -> Certificate | None:
     """:func:`safe_rl.evaluation.certify` with the options of the run, some of them changed."""
     options = certificate_options(load_config(directory), changes)
+    options = replace(options, deterministic=deterministic)
     make = maker_of(directory)
     certificate = certify(directory, options, make_env=make, num_threads=num_threads, progress=True)
     RunFolder(directory).certifying.unlink(missing_ok=True)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from safe_rl.cli.grammar import CommandLineError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import option
+
+if TYPE_CHECKING:
+    from safe_rl.cli.python_api import Run
 
 
 @dataclass
@@ -19,6 +24,7 @@ class ExportOptions:
     checkpoint: str = option(
         "", "last, best, certified, or a path; certified if there is one, else last"
     )
+    actions: str = option("", "of FILE.onnx: mean or sampled; as they are certified, else mean")
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
@@ -32,10 +38,12 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
     from safe_rl.evaluation.loading import find_checkpoint
-    from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
+    from safe_rl.evaluation.policies import describe, export_onnx, find_run, pack_policy
     from safe_rl.runs.folder import RunFolder
 
     import_modules(modules)
+    if options.actions not in ("", "mean", "sampled"):
+        raise CommandLineError(f"actions={options.actions}: they are mean or sampled.")
     run, target = Run(find_run(words[0])), Path(words[1])
     has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
@@ -43,9 +51,31 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         raise CommandLineError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
         check_imports(run.config, modules, run.directory)
+        checkpoint = find_checkpoint(run.directory, which)
+        sampled = _choose_actions(run, checkpoint, options.actions)
+        about = describe(run.directory, checkpoint, sampled=sampled)
         with closing(run.make_env()) as env:
-            export_onnx(run.config, env, find_checkpoint(run.directory, which), target)
+            export_onnx(run.config, env, checkpoint, target, sampled=sampled, about=about)
     else:
         target = pack_policy(run.directory, target, which)
     print(f"wrote {target}")
     return 0
+
+
+def _choose_actions(run: Run, checkpoint: Path, asked: str) -> bool:
+    """Whether the exported policy samples: as it was certified, unless the user asks otherwise."""
+    from safe_rl.evaluation.policies import is_sampled
+
+    certificate = run.certificate if checkpoint.parent.name == "certified" else None
+    if certificate is None:
+        return asked == "sampled"
+    certified = "sampled" if is_sampled(certificate) else "mean"
+    if asked not in ("", certified):
+        print(
+            f"WARNING: this policy is certified with {certified} actions. The file has its {asked} "
+            "actions, which the certificate does not cover, and so the file has no certificate. To "
+            "certify the policy with mean actions: safe-rl evaluate RUN_DIR certify=true "
+            "deterministic=true",
+            file=sys.stderr,
+        )
+    return (asked or certified) == "sampled"

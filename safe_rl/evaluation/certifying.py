@@ -50,7 +50,9 @@ class Certificate:
 
     def __str__(self) -> str:
         """One line: what is certified, and what the bounds do not cover."""
-        level, verdict = f"at {100 * self.options.level:.12g}%", self.verdict
+        actions = "mean" if self.options.deterministic else "sampled"
+        level = f"at {100 * self.options.level:.12g}% with {actions} actions"
+        verdict = self.verdict
         if self.checkpoint is None:
             missing = "; ".join(
                 f"{name} ≤ {rounded_up(bound):.3g}, limit {most:g}, mean {verdict.means[name]:.3g}"
@@ -117,7 +119,9 @@ def certify(
         return None
     # the device of training, where the simulation may run; without a GPU, the CPU
     device = config.device if torch.cuda.is_available() else "cpu"
-    plain = EvaluationOptions(device=device, num_threads=num_threads)
+    plain = EvaluationOptions(
+        device=device, num_threads=num_threads, deterministic=options.deterministic
+    )
     trials = [Trial(config, path, plain, make_env) for path in candidates]
     asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in asked})
@@ -188,7 +192,9 @@ def _run(
         policy = _side_by_side([each.policy(env) for each in trials])
         torch.manual_seed(own + purpose)
         for _ in range(math.ceil(number / batch)):
-            found = collect_episodes(env, policy, batch * together, keys, deterministic=False)
+            found = collect_episodes(
+                env, policy, batch * together, keys, deterministic=trial.options.deterministic
+            )
             # sorted by environment, so those of a trial follow each other
             columns = [found.returns, found.lengths, *found.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shlex
 import shutil
 import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -17,9 +20,10 @@ from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, transforms_of
 from safe_rl.extras import import_extra
 from safe_rl.files import read_json, read_yaml, replace_json, replacing, save_tensors
+from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import RunFolder, checkpoint_steps
@@ -93,37 +97,56 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     return kept
 
 
-class _MeanAction(nn.Module):
-    """Module from observations [N, D] to mean actions within the environment's bounds, [N, A]."""
+class _Deployed(nn.Module):
+    """Module from observations [N, D] to actions in the environment's own units, [N, A]."""
 
-    _low: Tensor
-    _high: Tensor
+    _bounds: Tensor
 
-    def __init__(self, policy: TensorDictModuleBase, low: Tensor, high: Tensor) -> None:
+    def __init__(self, policy: TensorDictModuleBase, bounds: Sequence[Tensor]) -> None:
         super().__init__()
         self._policy = policy
-        self.register_buffer("_low", low)
-        self.register_buffer("_high", high)
+        # of the policy's actions, then of the environment's: [4, A]
+        self.register_buffer("_bounds", torch.stack(list(bounds)))
 
     def forward(self, observation: Tensor) -> Tensor:
+        low, high, env_low, env_high = self._bounds
         given = TensorDict({"observation": observation}, batch_size=observation.shape[:1])
         action: Tensor = self._policy(given)["action"]
-        return torch.minimum(torch.maximum(action, self._low), self._high)
+        action = torch.minimum(torch.maximum(action, low), high)
+        return env_low + (action - low) * ((env_high - env_low) / (high - low))
 
 
-def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) -> None:
-    """Write a policy's mean action as a function of the observation, scaling of inputs included.
+def export_onnx(
+    config: DictConfig,
+    env: EnvBase,
+    checkpoint: Path,
+    file: Path,
+    *,
+    sampled: bool = False,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a policy as a function from the observation to the action that the environment takes.
 
-    The input ``observation`` is float32 [N, D] for any N, the output ``action`` [N, A]. ``env`` has
-    to be an environment with the observations and actions of the run.
+    The input ``observation`` is float32 [N, D] for any N, before any scaling. The output ``action``
+    [N, A] has the units and bounds of the environment itself, to which actions in [-1, 1] are
+    scaled if the run's environment does so. The file's metadata describe both; their values are
+    JSON.
+
+    Args:
+        config: Configuration of the run.
+        env: An environment with the observations and actions of the run.
+        checkpoint: The policy's weights.
+        file: The file to write.
+        sampled: Whether the graph samples its actions; else it returns their mean.
+        about: Further entries of the metadata.
 
     Raises:
         ModuleNotFoundError: If the extra ``onnx`` is not installed.
-        ValueError: If observations are no vectors, if actions are not numbers within bounds, or if
-            the policy is recurrent.
+        ValueError: If observations are no vectors, if actions are not numbers within bounds, if the
+            policy is recurrent, or if its samples cannot be drawn in a graph.
         CheckpointError: If the checkpoint does not fit the environment.
     """
-    import_extra("onnx", "onnx")
+    onnx = import_extra("onnx", "onnx")
     observation, action = env.observation_spec["observation"], env.action_spec
     if len(observation.shape) != 2 or not isinstance(action, Bounded):
         raise ValueError(
@@ -133,10 +156,17 @@ def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) 
     policy = load_policy(config, env, checkpoint, torch.device("cpu"))
     if len(policy.in_keys) != 1:
         raise ValueError(f"Policies that read {policy.in_keys} cannot be exported, only vectors.")
-    low, high = action.space.low[0], action.space.high[0]
-    example = torch.zeros(2, observation.shape[-1])
+    if sampled and not isinstance(policy, BehaviourPolicy | ExploringPolicy):
+        raise ValueError(
+            "The samples of this policy's distribution cannot be drawn in an ONNX graph. Export "
+            "the mean of its actions, actions=mean; a certificate of sampled actions does not "
+            "cover it."
+        )
+    bounds = [action.space.low[0], action.space.high[0], *env.action_bounds]
+    about = {**_interface(config, env, bounds[2:]), **(about or {})}
+    about["actions"] = "sampled" if sampled else "mean"
     with (
-        exploration(deterministic=True),
+        exploration(deterministic=not sampled),
         torch.no_grad(),
         warnings.catch_warnings(),
         replacing(file) as unfinished,
@@ -144,11 +174,56 @@ def export_onnx(config: DictConfig, env: EnvBase, checkpoint: Path, file: Path) 
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
-            _MeanAction(policy, low, high).eval(),
-            (example,),
+            _Deployed(policy, bounds).eval(),
+            (torch.zeros(2, observation.shape[-1]),),
             str(unfinished),
             input_names=["observation"],
             output_names=["action"],
             dynamic_axes={"observation": {0: "N"}, "action": {0: "N"}},
             dynamo=False,
         )
+        model = onnx.load(str(unfinished))
+        onnx.helper.set_model_props(model, {name: json.dumps(v) for name, v in about.items()})
+        onnx.save(model, str(unfinished))
+
+
+def _interface(config: DictConfig, env: EnvBase, bounds: Sequence[Tensor]) -> dict[str, Any]:
+    """What a program must know to use a policy: columns, units, the environment of training."""
+    return {
+        "observation": [
+            name if columns.stop - columns.start == 1 else f"{name}[{number}]"
+            for name, columns in env.observation_layout.items()
+            for number in range(columns.stop - columns.start)
+        ],
+        "action_low": bounds[0].tolist(),
+        "action_high": bounds[1].tolist(),
+        "steps_per_action": env.steps_per_decision,
+        "environment": OmegaConf.to_container(config.env, resolve=True),
+        "transforms": transforms_of(config),
+        "cost_limits": OmegaConf.to_container(config.cost_limits, resolve=True),
+    }
+
+
+def describe(run: Path, checkpoint: Path, *, sampled: bool) -> dict[str, Any]:
+    """Where a policy comes from, for the metadata of its file; a certificate only if it covers it.
+
+    Args:
+        run: Folder of the run.
+        checkpoint: The policy's weights.
+        sampled: Whether its actions are sampled when it is used.
+    """
+    folder, config = RunFolder(run), load_config(run)
+    found = read_json(folder.certificate) if checkpoint.parent.name == "certified" else None
+    covers = found is not None and is_sampled(found) == sampled
+    kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
+    return {
+        "algorithm": config.algo.name,
+        "steps": checkpoint_steps(checkpoint),
+        "commit": read_json(folder.code)[-1]["commit"] if folder.code.is_file() else None,
+        "certificate": {key: found.get(key) for key in kept} if found and covers else None,
+    }
+
+
+def is_sampled(certificate: Mapping[str, Any]) -> bool:
+    """Whether the content of ``certificate.json`` is about sampled actions, not their mean."""
+    return not certificate.get("deterministic", False)

@@ -103,6 +103,7 @@ class CertificateOptions:
         cap: Cost up to which an episode counts, above all limits; null: all, if costs are bounded.
         most_beyond: Share of episodes that may cost more than the cap.
         tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all episodes.
+        deterministic: Whether the policy acts with its mean actions; else it samples them.
     """
 
     ranking: Annotated[int, Interval(ge=2, le=10**6)]
@@ -114,6 +115,7 @@ class CertificateOptions:
     cap: PositiveFloat | None = None
     most_beyond: Share = 0.01
     tail: Fraction = 1.0
+    deterministic: bool = False
 
 
 def check_options(options: EvaluationOptions) -> None:

@@ -62,13 +62,25 @@ def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
     assert certificate.checkpoint.read_bytes()
     line = str(certificate)
     assert re.match(
-        r"Certified at 95%: mean_cost ≤ [\d.]+ \([\d.]+ in 1\d\d new episodes\), return ", line
+        r"Certified at 95% with sampled actions: mean_cost ≤ [\d.]+ "
+        r"\([\d.]+ in 1\d\d new episodes\), return ",
+        line,
     )
     assert "The bound includes rare episodes that cost up to 20." in line
     torch.rand(3)
     assert certify(directory, OPTIONS, make_env=make_env) == certificate
     student = certify(directory, replace(OPTIONS, bound="student"), make_env=make_env)
     assert "assumes that no rare episodes cost far more" in str(student)
+
+
+def test_mean_actions_are_certified_as_such(train):
+    directory = train("{cost: 19}")
+    sampled = certify(directory, OPTIONS, make_env=make_env)
+    assert not json.loads((directory / "certificate.json").read_text())["deterministic"]
+    mean = certify(directory, replace(OPTIONS, deterministic=True), make_env=make_env)
+    assert json.loads((directory / "certificate.json").read_text())["deterministic"]
+    assert "Certified at 95% with mean actions: " in str(mean)
+    assert mean.episode_return != sampled.episode_return
 
 
 def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train):
@@ -197,7 +209,7 @@ def test_what_an_episode_can_cost_is_known_from_the_environment():
 @pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
 def test_levels_are_not_rounded(level, shown):
     certificate = Certificate(None, math.nan, Verdict(None, []), replace(OPTIONS, level=level))
-    assert f"at {shown}: " in str(certificate)
+    assert f"at {shown} with sampled actions: " in str(certificate)
 
 
 def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():

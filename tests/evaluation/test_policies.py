@@ -1,12 +1,18 @@
 """Policies as small folders, those of the package, and policies as ONNX."""
 
 import json
+import re
 import shlex
 import shutil
+from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from torchrl.data import Unbounded
+from torchrl.envs import GymWrapper
+from torchrl.envs.libs.gym import default_info_dict_reader
 
 import safe_rl
 from safe_rl.cli.evaluate import main as evaluate
@@ -75,12 +81,16 @@ def test_policies_of_the_package_are_certified_and_small(path):
     assert sum(file.stat().st_size for file in path.parent.rglob("*")) < 150_000
 
 
-def test_an_exported_policy_is_the_policy(run, tmp_path):
+def exported(run, file, *options):
     runtime = pytest.importorskip("onnxruntime")
-    assert export([str(run), str(tmp_path / "policy.onnx"), "checkpoint=last"]) == 0
+    assert export([str(run), str(file), *options]) == 0
+    return runtime.InferenceSession(file)
+
+
+def test_an_exported_policy_is_the_policy(run, tmp_path):
+    session = exported(run, tmp_path / "policy.onnx", "checkpoint=last")
     loaded = safe_rl.load(run)
     env = loaded.make_env(num_envs=5)
-    session = runtime.InferenceSession(tmp_path / "policy.onnx")
     state = env.reset()
     for _ in range(3):
         with exploration(deterministic=True):
@@ -90,6 +100,98 @@ def test_an_exported_policy_is_the_policy(run, tmp_path):
         expected = state["action"].clamp(low, high).numpy()
         np.testing.assert_allclose(action, expected, atol=1e-5)
         state = env.step(state)["next"]
+
+
+class Tank(gymnasium.Env):
+    """A tank that is filled by 0 to 2 litres a step: the amount is the reward, above 1 it costs."""
+
+    action_space = gymnasium.spaces.Box(0.0, 2.0, (1,), np.float32)
+    observation_space = gymnasium.spaces.Box(0.0, 100.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.level = 0.0
+        return np.array([self.level], np.float32), {}
+
+    def step(self, action):
+        amount = float(action[0])
+        self.level += amount
+        seen = np.array([self.level], np.float32)
+        return seen, amount, False, False, {"cost": np.float32(max(0.0, amount - 1))}
+
+
+def tank_of_torchrl():
+    """The same for TorchRL, with the cost beside the reward."""
+    reader = default_info_dict_reader(["cost"], [Unbounded((1,))])
+    return GymWrapper(gymnasium.make("Tank-v0")).set_info_dict_reader(reader)
+
+
+gymnasium.register("Tank-v0", entry_point=Tank, max_episode_steps=20)
+PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
+FAMILIES = {
+    "PointGoal1": ({"env.num_steps": 20}, "Safexp-PointGoal1-v0", {"config": {"num_steps": 20}}),
+    "SafeHumanoidVelocity": (
+        {"env.num_steps": 8}, "SafeHumanoidVelocity-v0", {"config": {"num_steps": 8}}
+    ),
+    "gymnasium": ({"env.id": "Tank-v0"}, "Tank-v0", {}),
+    "torchrl": (
+        {"env.id": f"{__name__}.tank_of_torchrl", "env.num_steps": 20, "imports": [__name__]},
+        "Tank-v0", {},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("family", "algo"),
+    [*((family, "ppo_lagrangian") for family in FAMILIES), ("gymnasium", "sac_lagrangian")],
+)
+def test_an_exported_policy_acts_in_the_environment_itself(family, algo, tmp_path):
+    settings, env_id, keys = FAMILIES[family]
+    small = {"frames": 80, "num_envs": 2, "frames_per_batch": 40, "logger": "none"}
+    run = safe_rl.train(family, algo=algo, directory=tmp_path / "run", **small, **settings)
+    words = [f"import={name}" for name in settings.get("imports", ())]
+    session = exported(run.directory, tmp_path / "policy.onnx", *words)
+    code = re.search(r"<!-- file: run_onnx.py -->\n```python\n(.*?)```", PAGE.read_text(), re.S)
+    program: dict = {}
+    exec(code[1], program)
+    policy = program["OnnxPolicy"](tmp_path / "policy.onnx")
+    env = gymnasium.make(env_id, **keys)
+    found = program["run_episode"](env, policy, seed=7)
+    given = {"episodes": 1, "num_envs": 1, "num_threads": 1, "seed": 7, "deterministic": True}
+    expected = run.evaluate(**given).estimates
+    named = [expected[name].value for name in ("episode_return", "episode_cost")]
+    np.testing.assert_allclose(found, named, rtol=1e-2, atol=1e-2)
+    assert policy.about["action_low"] == env.action_space.low.tolist()
+    assert policy.about["action_high"] == env.action_space.high.tolist()
+    assert len(policy.about["observation"]) == session.get_inputs()[0].shape[1]
+    assert policy.about["environment"]["name"] == run.config.env.name
+
+
+def certified(run, deterministic):
+    shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified", dirs_exist_ok=True)
+    content = {"certified": True, "deterministic": deterministic, "level": 0.95, "bounds": {}}
+    (run / "certificate.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_what_is_certified_is_what_is_exported(run, tmp_path, capsys, deterministic):
+    certified(run, deterministic)
+    file = tmp_path / "policy.onnx"
+    zeros = {"observation": np.zeros((2, 60), np.float32)}
+    session = exported(run, file)
+    texts = session.get_modelmeta().custom_metadata_map
+    kinds = {True: "mean", False: "sampled"}
+    assert json.loads(texts["actions"]) == kinds[deterministic]
+    assert json.loads(texts["certificate"])["level"] == 0.95
+    # the rows see the same: they act alike unless actions are sampled
+    (actions,) = session.run(["action"], zeros)
+    assert np.array_equal(*actions) == deterministic
+    assert "WARNING" not in capsys.readouterr().err
+    other = exported(run, file, f"actions={kinds[not deterministic]}")
+    assert "which the certificate does not cover" in capsys.readouterr().err
+    texts = other.get_modelmeta().custom_metadata_map
+    assert json.loads(texts["actions"]) == kinds[not deterministic]
+    assert json.loads(texts["certificate"]) is None
 
 
 def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
