@@ -6,24 +6,28 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.off_policy_networks import bounded_actions
 from safe_rl.algorithms.replay_buffer import Memory
-from safe_rl.collectors import read_dataset, safe_episodes
+from safe_rl.collectors import read_action_bounds, read_dataset, safe_episodes
 from safe_rl.files import read_config
+
+_ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
 
 
 def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tuple[str, bool]:
     """Fill an empty replay buffer with the dataset of a configuration, if it has one.
 
     The node ``dataset`` has a ``path``, of a recording's folder or of an HDF5 file, and says with
-    ``safe_episodes`` whether only whole episodes within the limits are taken. Actions are clipped
-    to the environment's bounds.
+    ``safe_episodes`` whether only whole episodes within the limits are taken. Actions of an HDF5
+    file are in the environment's own units, those of a recording in its policy's.
 
     Returns:
         Two values. The first is a sentence on the data that the run learns from, a warning that it
@@ -88,11 +92,56 @@ def _fill(
             f"{what}. There must be some, and room for them: memory.capacity={buffer.capacity}."
         )
     _check_finite(steps, node, buffer.in_keys)
-    steps["action"] = steps["action"].clamp(actions.low.cpu(), actions.high.cpu())
+    steps["action"] = _as_chosen(steps["action"], node.path, env, actions)
     buffer.extend(steps)
     buffer.end_rows()
     kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
     return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}."
+
+
+def _as_chosen(action: Tensor, path: str, env: EnvBase, spec: TensorSpec) -> Tensor:
+    """Actions [N, T, A] of a dataset in the units in which policies choose them.
+
+    HDF5 files have the environment's own units. A recording has those of its policy, which may
+    have chosen actions outside the bounds: the environment clipped them.
+
+    Raises:
+        ValueError: If actions of a file, or of another environment, are outside the bounds.
+    """
+    chosen = [spec.low.cpu(), spec.high.cpu()]
+    own = [bound.flatten() for bound in env.action_bounds]
+    if Path(path).is_dir():
+        recorded = read_action_bounds(path) or [*chosen, *own]
+        action = action.clamp(*recorded[:2])
+        if all(map(torch.equal, recorded, [*chosen, *own])):
+            return action
+        action = _rescaled(action, recorded[:2], recorded[2:])
+    _check_bounds(action, path, *own)
+    return _rescaled(action, own, chosen).clamp(*chosen)
+
+
+def _rescaled(action: Tensor, old: list[Tensor], new: list[Tensor]) -> Tensor:
+    """Actions in other units, whose bounds are known in both."""
+    if all(map(torch.equal, old, new)):
+        return action
+    share = (action - old[0]) / (old[1] - old[0])
+    return new[0] + share * (new[1] - new[0])
+
+
+def _check_bounds(action: Tensor, path: str, low: Tensor, high: Tensor) -> None:
+    """Refuse actions [N, T, A] outside the bounds [A] by more than a rounding error."""
+    action, width = action.flatten(0, 1), _ROUNDING * (high - low)
+    beyond = (action < low - width) | (action > high + width)
+    if not beyond.any():
+        return
+    column = int(beyond.sum(0).argmax())
+    values = action[:, column]
+    raise ValueError(
+        f"dataset.path={path}: {beyond.any(-1).float().mean():.1%} of its actions are outside the "
+        f"bounds of this environment. Those of column {column} are from {values.min():g} to "
+        f"{values.max():g}, and the bounds are {low[column]:g} and {high[column]:g}. Actions of a "
+        "dataset are in the environment's own units: rescale them, or remove these episodes."
+    )
 
 
 def _check(

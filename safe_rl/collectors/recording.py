@@ -2,20 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
-from safe_rl.files import check_no_links, load_tensors, save_tensors
+from safe_rl.files import check_no_links, load_tensors, read_json, replace_json, save_tensors
 
+ABOUT = "recording.json"
+"""File of a recording with what :func:`describe_env` says of its environment."""
 PARTIAL = "partial"
 """Entry [N, T, 1] bool, true in at least one step of an episode that is not recorded completely."""
 
+BOUNDS = ("low", "high", "own_low", "own_high")
 # other entries, such as those that a policy writes, are not recorded
 _FLAGS = ("done", "terminated", "truncated")
+
+
+def describe_env(env: EnvBase) -> dict[str, Any]:
+    """What is recorded beside the steps of an environment: the units of its actions.
+
+    ``actions`` has the bounds of recorded actions, ``low`` and ``high``, and those that the
+    environment has in its own units, ``own_low`` and ``own_high``; it is None for choices.
+    """
+    if env.action_bounds is None:
+        return {"actions": None}
+    spec = env.action_spec_unbatched
+    bounds = dict(zip(BOUNDS, (spec.low, spec.high, *env.action_bounds), strict=True))
+    return {"actions": {name: bound.flatten().tolist() for name, bound in bounds.items()}}
+
+
+def read_action_bounds(folder: Path | str) -> list[Tensor] | None:
+    """Bounds of a recording's actions as :func:`describe_env` lists them, [A] each; None: unknown.
+
+    Raises:
+        ValueError: If the file cannot be read.
+    """
+    path = Path(folder) / ABOUT
+    if not path.exists():
+        return None
+    try:
+        actions = read_json(path)["actions"]
+        return actions and list(torch.tensor([actions[name] for name in BOUNDS]).float())
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} does not describe a recording: {error}") from error
 
 
 class Recording:
@@ -24,6 +58,8 @@ class Recording:
     Args:
         folder: Path of the folder, which is made if it does not exist.
         cost_keys: Costs below ``next`` that are recorded.
+        about: Units of the actions, :func:`describe_env` of the environment. None: they are those
+            of the environment in which the recording is used.
 
     Raises:
         KeyError: When a batch is written that lacks one of the entries.
@@ -46,8 +82,13 @@ class Recording:
         torch.Size([1, 6])
     """
 
-    def __init__(self, folder: Path | str, cost_keys: Sequence[str]) -> None:
-        self.folder = Path(folder)
+    def __init__(
+        self,
+        folder: Path | str,
+        cost_keys: Sequence[str],
+        about: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.folder, self._about = Path(folder), about
         following = ("observation", "reward", *cost_keys, *_FLAGS)
         self._keys = ["observation", "action", *(("next", key) for key in following)]
         self._cut: int | None = None  # number of the last batch after which new episodes begin
@@ -64,6 +105,8 @@ class Recording:
         unfinished = self.folder.glob(".*.pt")  # of a run that was killed
         for path in [*unfinished, *(p for p in _pieces(self.folder) if int(p.stem) >= number)]:
             path.unlink()
+        if not number:
+            (self.folder / ABOUT).unlink(missing_ok=True)
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T]; an earlier file with the same number is replaced.
@@ -103,6 +146,8 @@ class Recording:
 
     def _store(self, number: int, steps: TensorDictBase) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self._about is not None and not (self.folder / ABOUT).exists():
+            replace_json(self.folder / ABOUT, self._about)
         # of a view, torch would save the whole underlying storage
         save_tensors(self._place(number), steps.clone().to_dict())
 

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.collectors import Recording, StepRecorder
+from safe_rl.collectors import Recording, StepRecorder, describe_env
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     find_checkpoint,
@@ -121,7 +121,9 @@ class Trial:
             unjudged = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
             limits |= check_cost_limits(options.cost_limits, env.cost_keys)
             policy = self.policy(env)  # before an earlier recording is removed: it may not fit
-            recorder = None if record is None else StepRecorder(Recording(record, env.cost_keys))
+            recorder = None
+            if record is not None:
+                recorder = StepRecorder(Recording(record, env.cost_keys, describe_env(env)))
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,

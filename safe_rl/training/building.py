@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.collectors import Recording, WorkerCollector, make_collector
+from safe_rl.collectors import Recording, WorkerCollector, describe_env, make_collector
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.files import read_config
 from safe_rl.runs.checkpoints import read_states
@@ -74,7 +74,7 @@ def build_trainer(
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
     record = RunRecord(directory, config, cost_limits, env.max_episode_steps)
-    recording = Recording(record.folder.transitions, env.cost_keys)
+    recording = Recording(record.folder.transitions, env.cost_keys, describe_env(env))
     return Trainer(
         env=env,
         algorithm=algorithm,
