@@ -29,10 +29,10 @@ from omegaconf import OmegaConf
 from train_throughput import new_env
 
 from safe_rl.algorithms import TRPOStep
-from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.objectives import LagrangeMultiplier, TRPOLagrangianLoss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.run import Run
 from safe_rl.training.building import build_trainer, seed_everything
 
 STEP = {
@@ -47,7 +47,7 @@ def restored(run: Path, directory: Path):
     """Trainer of a run at its newest checkpoint, with another seed for what comes."""
     config = OmegaConf.load(run / "config.yaml")
     trainer = build_trainer(config, new_env(config), directory)
-    CheckpointStore.load(find_checkpoint(run, "last"), trainer.components())
+    CheckpointStore.load(Run(run).find_checkpoint("last"), trainer.components())
     seed_everything(12_345, None)
     return trainer
 

@@ -9,7 +9,8 @@ from omegaconf import OmegaConf
 
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.runs import table
-from safe_rl.runs.folder import paths_below, runs_below
+from safe_rl.runs.folder import paths_below
+from safe_rl.runs.run import find_runs
 
 VALUES = st.recursive(
     st.none()
@@ -127,5 +128,5 @@ def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monk
         return list_folder(path)
 
     monkeypatch.setattr(os, "scandir", vanish)
-    assert [run.directory.name for run in runs_below(tmp_path)] == ["a", "b"]
+    assert [run.directory.name for run in find_runs(tmp_path)] == ["a", "b"]
     assert paths_below(tmp_path, "*.mp4") == []

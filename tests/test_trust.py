@@ -79,7 +79,7 @@ def test_partial_nodes_wait_for_their_arguments():
         *("subprocess.run", "pickle.loads", "importlib.import_module", "hydra.utils.instantiate"),
         # commands, and what imports modules or writes files
         *("safe_rl.extras.import_extra", "safe_rl.trust.allow", "safe_rl.cli.train.main"),
-        *("safe_rl.runs.folder.RunFolder", "safe_rl.reporting.write_report"),
+        *("safe_rl.runs.run.Run", "safe_rl.reporting.write_report"),
         # by way of what an allowed module has imported
         *("safe_rl.cli.os.system", "safe_rl.collectors.workers.torch.load"),
         *("safe_rl.collectors.workers.signal.raise_signal", "safe_rl.runs.loggers.Path"),

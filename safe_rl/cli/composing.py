@@ -30,8 +30,8 @@ from safe_rl.envs.families import GROUP, env_names, hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, read_config, read_yaml
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.identity import flatten, role_of
+from safe_rl.runs.run import Run
 
 _ONE_EACH = ("env", "algo", "preset", "model", "risk", "collector", "logger", "lagrangian")
 _MOST_LISTED = 40
@@ -277,19 +277,19 @@ def compose_resumed(
         CommandLineError: If it is not the folder of a run, or a key cannot change.
         SettingError: If a run cannot have a value.
     """
-    run = RunFolder(directory)
+    run = Run(directory)
     try:
         run.check_is_run()
-        if run.checkpoints.exists() and not run.has_begun:
+        if run.checkpoints_folder.exists() and not run.has_begun:
             raise ValueError("it has no progress.csv: an exported policy cannot be trained on")
-        config = OmegaConf.create(read_config(run.config))
-        said = read_yaml(run.overrides) if run.overrides.is_file() else None
+        config = OmegaConf.create(read_config(run.config_file))
+        said = read_yaml(run.overrides_file) if run.overrides_file.is_file() else None
     except (OSError, ValueError) as error:
         raise CommandLineError(f"resume={directory}: {error}") from None
     check_imports(config, modules, directory)
     overrides = [parse(text) for text in (*texts, *note_imports(modules))]
     _check_form(overrides)
-    _refuse_foreign_cluster(config, overrides, run.config)
+    _refuse_foreign_cluster(config, overrides, run.config_file)
     for override in overrides:
         _change(config, override, directory, said or ())
     _check_read(overrides, config)

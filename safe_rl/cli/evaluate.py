@@ -21,11 +21,11 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
     """Evaluate or certify a run, or run it under variations, and print the results."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
-    from safe_rl.evaluation.loading import load_config
     from safe_rl.evaluation.policies import find_run
+    from safe_rl.runs.run import Run
 
     directory = find_run(words[0])
-    check_imports(load_config(directory), modules, directory)
+    check_imports(Run(directory).config, modules, directory)
     import_modules(modules)
     if options.certify:
         return _certify(directory, options)

@@ -20,13 +20,12 @@ from safe_rl.evaluation import (
     certify,
     evaluate,
 )
-from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.variations import Varied, evaluate_variations
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.reporting.figures import draw_variations
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 
 
 def evaluate_run(
@@ -52,11 +51,11 @@ def certify_run(
     deterministic: bool = False,
 ) -> Certificate | None:
     """:func:`safe_rl.evaluation.certify` with the options of the run, some of them changed."""
-    options = certificate_options(load_config(directory), changes)
+    options = certificate_options(Run(directory).config, changes)
     options = replace(options, deterministic=deterministic)
     make = maker_of(directory)
     certificate = certify(directory, options, make_env=make, num_threads=num_threads, progress=True)
-    RunFolder(directory).certifying.unlink(missing_ok=True)
+    Run(directory).certifying_file.unlink(missing_ok=True)
     return certificate
 
 
@@ -93,6 +92,6 @@ def evaluate_varied(
     directory = writable_copy(directory)
     make = maker_of(directory)
     found = evaluate_variations(directory, options, make_env=make, progress=progress)
-    picture = RunFolder(directory).variations(options.name, "png")
+    picture = Run(directory).variations_file(options.name, "png")
     draw_variations(found.rows, found.cost_limits, picture)
     return found, picture

@@ -37,21 +37,19 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     """Write a policy to a file, or to a folder."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
-    from safe_rl.evaluation.loading import find_checkpoint
     from safe_rl.evaluation.policies import describe, export_onnx, find_run, pack_policy
-    from safe_rl.runs.folder import RunFolder
 
     import_modules(modules)
     if options.actions not in ("", "mean", "sampled"):
         raise CommandLineError(f"actions={options.actions}: they are mean or sampled.")
     run, target = Run(find_run(words[0])), Path(words[1])
-    has_certified = RunFolder(run.directory).newest_checkpoint("certified") is not None
+    has_certified = run.newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
     if target.suffix not in ("", ".onnx"):
         raise CommandLineError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
         check_imports(run.config, modules, run.directory)
-        checkpoint = find_checkpoint(run.directory, which)
+        checkpoint = run.find_checkpoint(which)
         sampled = _choose_actions(run, checkpoint, options.actions)
         about = describe(run.directory, checkpoint, sampled=sampled)
         with closing(run.make_env()) as env:

@@ -8,14 +8,12 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import torch
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
@@ -32,12 +30,9 @@ from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
-from safe_rl.files import read_json
 from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.display import outcome_line
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.outcome import final_figures
-from safe_rl.runs.table import read_table
+from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 
 if TYPE_CHECKING:
@@ -187,7 +182,7 @@ def load(
     run = Run(find_run(directory), checkpoint)
     check_imports(run.config, imports, run.directory)
     import_modules(imports)
-    loading.find_checkpoint(run.directory, checkpoint)
+    run.find_checkpoint(checkpoint)
     return run
 
 
@@ -205,13 +200,16 @@ def report(directory: str | Path, **options: Any) -> Path:
     return report_command.report(Path(directory).expanduser(), given)[1]
 
 
-@dataclass(frozen=True, repr=False)
-class Run:
+class Run(RecordedRun):
     """A run in its folder: table, environment and trained policy.
+
+    Args:
+        directory: Its folder.
+        checkpoint: The checkpoint of ``policy``: "last", "best", "certified", or a path.
 
     Attributes:
         directory: Its folder.
-        checkpoint: The checkpoint of ``policy``: "last", "best", "certified", or a path.
+        checkpoint: The checkpoint of ``policy``.
 
     Examples:
         >>> run = getfixture("tiny_run")  # what `safe_rl.train` returns
@@ -221,23 +219,9 @@ class Run:
         torch.Size([1, 5])
     """
 
-    directory: Path
-    checkpoint: str = "last"
-
-    @cached_property
-    def config(self) -> DictConfig:
-        """Its whole configuration."""
-        return loading.load_config(self.directory)
-
-    @cached_property
-    def table(self) -> dict[str, list[float]]:
-        """The columns of ``progress.csv``; NaN in epochs in which no episode ended."""
-        return read_table(RunFolder(self.directory).table)
-
-    @property
-    def final(self) -> dict[str, float]:
-        """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``)."""
-        return final_figures(self.table, list(self.config.cost_limits) or ["cost"])
+    def __init__(self, directory: Path | str, checkpoint: str = "last") -> None:
+        super().__init__(directory)
+        self.checkpoint = checkpoint
 
     @cached_property
     def env(self) -> EnvBase:
@@ -247,14 +231,8 @@ class Run:
     @cached_property
     def policy(self) -> TensorDictModuleBase:
         """Its trained policy; :func:`torchrl.envs.set_exploration_type` selects mean or sample."""
-        path = loading.find_checkpoint(self.directory, self.checkpoint)
+        path = self.find_checkpoint(self.checkpoint)
         return loading.load_policy(self.config, self.env, path, torch.device("cpu"))
-
-    @property
-    def certificate(self) -> dict[str, Any] | None:
-        """The content of ``certificate.json``, or None if there is no such file."""
-        path = RunFolder(self.directory).certificate
-        return read_json(path) if path.is_file() else None
 
     def to_pandas(self) -> pandas.DataFrame:
         """Its table as a data frame with a row per epoch; needs the extra ``report``."""
@@ -262,17 +240,15 @@ class Run:
 
     def plot(self) -> Figure:
         """Its learning curves, a Matplotlib figure: return, costs, cost rates and multipliers."""
-        config, length = self.config, self.env.max_episode_steps
-        title = f"{config.env.name} {config.algo.name} seed {config.seed}"
-        return learning_curves(self.table, dict(config.cost_limits), length, title)
+        length = self.env.max_episode_steps
+        title = f"{self.environment} {self.algorithm} seed {self.seed}"
+        return learning_curves(self.table, self.cost_limits, length, title)
 
     def __repr__(self) -> str:
         """Algorithm, environment, outcome and certificate."""
-        config = self.config
-        lines = [f"Run({str(self.directory)!r}): {config.algo.name} on {config.env.name}"]
-        if RunFolder(self.directory).num_rows:
-            length = int(config.env.get("num_steps") or 1000)
-            lines.append(outcome_line(self.table, dict(config.cost_limits), length))
+        lines = [f"Run({str(self.directory)!r}): {self.algorithm} on {self.environment}"]
+        if self.num_rows:
+            lines.append(outcome_line(self.table, self.cost_limits, self.episode_length or 1000))
         if (found := self.certificate) is not None:
             shown = found["bounds"] if found["certified"] else {}
             bounds = [f"{name} ≤ {rounded_up(b['bound']):.3g}" for name, b in shown.items()]
@@ -284,7 +260,7 @@ class Run:
     def _repr_html_(self) -> str:
         """The same for a notebook, with the learning curves."""
         text = f"<pre>{html.escape(repr(self))}</pre>"
-        curves = RunFolder(self.directory).curves
+        curves = self.curves_file
         picture = base64.b64encode(curves.read_bytes()).decode() if curves.is_file() else ""
         shown = f'<img alt="learning curves" src="data:image/png;base64,{picture}">'
         return text + (shown if picture else "")

@@ -20,7 +20,7 @@ from safe_rl import envs
 from safe_rl.envs import ConfigError
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
 from safe_rl.files import read_json, replace_json
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 
 
 def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
@@ -40,7 +40,7 @@ def new_folder(hydra: DictConfig) -> tuple[Path, bool]:
     return path, True
 
 
-def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
+def keep_robot(folder: Run, env: Mapping[str, Any]) -> None:
     """Note which custom robot a run begins with, and copy its files.
 
     If the files cannot be copied, the note has their hash only, and the reason is printed.
@@ -48,17 +48,17 @@ def keep_robot(folder: RunFolder, env: Mapping[str, Any]) -> None:
     robot = _own_robot(env)
     if robot is None:
         return
-    shutil.rmtree(folder.robot, ignore_errors=True)
+    shutil.rmtree(folder.robot_folder, ignore_errors=True)
     note = {"robot_base": env["robot_base"], "sha256": fingerprint(robot), "file": None}
     try:
-        note["file"] = str(copy_robot(robot, folder.robot).relative_to(folder.robot))
+        note["file"] = str(copy_robot(robot, folder.robot_folder).relative_to(folder.robot_folder))
     except ConfigError as error:
-        shutil.rmtree(folder.robot, ignore_errors=True)
+        shutil.rmtree(folder.robot_folder, ignore_errors=True)
         print(f"{error} The run keeps no copy of its robot: it needs that file as it is now.")
-    replace_json(folder.robot_note, note)
+    replace_json(folder.robot_file, note)
 
 
-def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
+def robot_of(folder: Run, env: Mapping[str, Any]) -> dict[str, Any]:
     """Return an environment's node with the robot that a run began with.
 
     A node that names another robot, or a run that has not begun, changes nothing.
@@ -66,14 +66,14 @@ def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: If the file of the robot is gone, or has changed.
     """
-    note = read_json(folder.robot_note) if os.path.isfile(folder.robot_note) else {}
+    note = read_json(folder.robot_file) if os.path.isfile(folder.robot_file) else {}
     if not note or note["robot_base"] != env.get("robot_base"):
         return dict(env)
     original, content = _own_robot(env), note["sha256"]
-    path = folder.robot / str(note["file"]) if note["file"] else original
+    path = folder.robot_folder / str(note["file"]) if note["file"] else original
     if path is None or not path.is_file():
         raise ConfigError(f"'robot_base': there is no file {path}, with which the run began.")
-    home = folder.robot if note["file"] else Path(path.anchor or ".")
+    home = folder.robot_folder if note["file"] else Path(path.anchor or ".")
     if not is_robot(path, home, content):
         raise ConfigError(f"'robot_base': {path} has changed since the run began.")
     return {**env, "robot_base": str(path)}
@@ -81,7 +81,7 @@ def robot_of(folder: RunFolder, env: Mapping[str, Any]) -> dict[str, Any]:
 
 def maker_of(directory: Path) -> Callable[..., envs.ConstrainedEnv]:
     """:func:`safe_rl.envs.make_env` for a run's environments, with the robot that it began with."""
-    folder = RunFolder(directory)
+    folder = Run(directory)
     return lambda env, **options: envs.make_env(robot_of(folder, env), **options)
 
 

@@ -29,9 +29,10 @@ from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import replacing
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.folder import RunFolder, RunInUseError, lock_folder
+from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableError, read_table
 from safe_rl.training.building import begin_from, build_trainer, physics_threads, seed_everything
 from safe_rl.training.trainer import Trainer
@@ -77,7 +78,7 @@ class Session:
             self._is_new = not folder.exists()
         with open_dict(config):
             self.hydra = config.pop("hydra", None)
-        self.config, self.folder = config, RunFolder(folder)
+        self.config, self.folder = config, Run(folder)
         self._continues, self._callbacks, self._program = continues, callbacks, program
         modules = list(config.get("import") or [])
         self._imports = "".join(f" import={quote(name)}" for name in modules)
@@ -101,11 +102,13 @@ class Session:
             is_job = self._continues and self.hydra is not None
             if is_job:  # its folder may hold a run with other settings
                 check_same_run(self.folder.directory, self.config)
-            with lock_folder(self.folder):
+            with lock_folder(self.folder.lock_file):
                 trainer = self._prepare()
                 self._has_begun = True
                 if trainer is not None:
-                    if self.hydra is not None and not (is_job and self.folder.notes.exists()):
+                    if self.hydra is not None and not (
+                        is_job and self.folder.notes_folder.exists()
+                    ):
                         self._write_notes(self.hydra)
                     outcome = trainer.run()
         except RunInUseError:
@@ -115,9 +118,9 @@ class Session:
             if self._is_new and not (self._has_begun or self.folder.has_begun):
                 shutil.rmtree(self.folder.directory, ignore_errors=True)
         if trainer is None:
-            if self.folder.certifying.exists():
+            if self.folder.certifying_file.exists():
                 self._certify()
-            elif not (is_job or self.folder.certificate.exists()):
+            elif not (is_job or self.folder.certificate_file.exists()):
                 length = int(self.config.env.get("num_steps") or 1000)
                 self._certify_if_long(length, self.config.algo.get("constrained") is not False)
             return
@@ -152,7 +155,13 @@ class Session:
         if not (isinstance(callbacks, list | tuple) and all(map(callable, callbacks))):
             raise ConfigError(f"callbacks must be a list of functions, [f], got {callbacks!r}.")
         # of a run, of an exported policy, or the user's own, which this run would replace
-        places = (folder.table, folder.config, folder.checkpoints, folder.robot, folder.transitions)
+        places = (
+            folder.table_file,
+            folder.config_file,
+            folder.checkpoints_folder,
+            folder.robot_folder,
+            folder.transitions_folder,
+        )
         taken = next((place for place in places if place.exists()), None)
         if not self._continues and taken is not None:
             key = "hydra.run.dir" if self._program else "directory"
@@ -164,9 +173,9 @@ class Session:
                 f"{folder.directory} already holds a run. Continue it with: {self._again}; or give "
                 f"this one another folder, {key}=…"
             )
-        if self._continues and is_finished(folder.directory, config.frames):
+        if self._continues and is_finished(folder.checkpoints("last"), config.frames):
             more = ": raise 'frames' to train on"
-            if folder.certifying.exists():
+            if folder.certifying_file.exists():
                 more = "; certifying it, as was begun"
             print(f"{folder.directory} has its {config.frames:,} frames already{more}.")
             return None
@@ -191,7 +200,7 @@ class Session:
             print("No checkpoint was written yet: starting over, with a new progress.csv.")
         if config.init_from is not None:
             begin_from(trainer.algorithm, config)
-        if not (self._continues and folder.robot_note.exists()):
+        if not (self._continues and folder.robot_file.exists()):
             keep_robot(folder, plain(config)["env"])
         return trainer
 
@@ -223,9 +232,9 @@ class Session:
     def _write_notes(self, hydra: DictConfig) -> None:
         """Write Hydra's notes; Hydra itself would write them before the run is known to begin."""
         folder = self.folder
-        folder.notes.mkdir(exist_ok=True)
-        notes = ((folder.composed, self.config), (folder.overrides, hydra.overrides.task),
-                 (folder.surroundings, OmegaConf.create({"hydra": hydra})))  # fmt: skip
+        folder.notes_folder.mkdir(exist_ok=True)
+        notes = ((folder.composed_file, self.config), (folder.overrides_file, hydra.overrides.task),
+                 (folder.hydra_file, OmegaConf.create({"hydra": hydra})))  # fmt: skip
         for path, content in notes:
             with replacing(path) as unfinished:
                 OmegaConf.save(content, unfinished)
@@ -250,8 +259,8 @@ class Session:
         """Certify the run; if this is interrupted, a file remains, and resuming certifies it."""
         folder = self.folder
         try:
-            with lock_folder(folder):
-                folder.certifying.touch()
+            with lock_folder(folder.lock_file):
+                folder.certifying_file.touch()
                 threads, changes = self.config.num_threads or 0, self.config.certificate
                 certificate = certify_run(folder.directory, num_threads=threads, changes=changes)
         except KeyboardInterrupt:
@@ -273,14 +282,14 @@ def run_job(config: DictConfig, hydra: DictConfig) -> float:
         SystemExit: If it is interrupted.
         ValueError: If its folder holds a run with other settings.
     """
-    folder = RunFolder(Path(hydra.runtime.output_dir).resolve())
+    folder = Run(Path(hydra.runtime.output_dir).resolve())
     check_settings(config)
     check_risk(config)  # for this combination of a sweep's values
     with open_dict(config):
         config.hydra = hydra
     Session(config, folder.directory, continues=True).run()
     limits = dict(config.cost_limits)
-    figures = final_figures(read_table(folder.table), list(limits))
+    figures = final_figures(read_table(folder.table_file), list(limits))
     value = figures["episode_return"]
     is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
     return -math.inf if is_above or math.isnan(value) else value

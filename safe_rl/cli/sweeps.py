@@ -20,7 +20,8 @@ from safe_rl.envs import store_configs
 from safe_rl.files import replace_text
 from safe_rl.processes import end_with_parent
 from safe_rl.runs.display import LINE_SECONDS
-from safe_rl.runs.folder import RunFolder, RunInUseError
+from safe_rl.runs.folder import RunInUseError
+from safe_rl.runs.run import Run
 
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
@@ -73,7 +74,7 @@ class Sweep:
         from safe_rl.cli.session import run_job  # with torch: a sweep is checked without it
 
         hydra = cast(DictConfig, HydraConfig.get())
-        folder = RunFolder(Path(hydra.runtime.output_dir))
+        folder = Run(Path(hydra.runtime.output_dir))
         self._note(hydra, "interrupted")  # unless another line follows
         if os.getppid() == self._process:
             # otherwise the job would go on, or wait for ever, after the sweep was killed
@@ -84,11 +85,11 @@ class Sweep:
             summary = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]}"
             if not isinstance(error, RunInUseError):  # then another process owns the folder
                 folder.directory.mkdir(parents=True, exist_ok=True)
-                replace_text(folder.failure, "".join(traceback.format_exception(error)))
-                summary += f" (see {folder.failure.name} there)"
+                replace_text(folder.failure_file, "".join(traceback.format_exception(error)))
+                summary += f" (see {folder.failure_file.name} there)"
             self._note(hydra, "failed", f": {summary}")
             return -math.inf
-        folder.failure.unlink(missing_ok=True)
+        folder.failure_file.unlink(missing_ok=True)
         self._note(hydra, "done")
         return value
 

@@ -17,11 +17,11 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
-from safe_rl.evaluation.loading import load_config
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, replace_json, replacing
-from safe_rl.runs.folder import RunFolder, checkpoint_steps, checkpoints_in
+from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.run import Run
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
 
@@ -110,10 +110,10 @@ def certify(
     Returns:
         The certificate; None if the run has no limits or no checkpoints.
     """
-    config = load_config(directory)
-    folder = RunFolder(directory)
+    run = Run(directory)
+    config = run.config
     check_no_links(directory)
-    candidates = _candidates(folder)
+    candidates = _candidates(run)
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:
         return None
@@ -146,8 +146,8 @@ def certify(
     if verdict.certified is not None:
         kept = candidates[verdict.certified]
         episode_return = torch.cat(returns[verdict.certified]).mean().item()
-    certificate = Certificate(_keep(folder, kept), episode_return, verdict, options)
-    _write(folder, certificate, [checkpoint_steps(path) for path in candidates])
+    certificate = Certificate(_keep(run, kept), episode_return, verdict, options)
+    _write(run, certificate, [checkpoint_steps(path) for path in candidates])
     return certificate
 
 
@@ -155,9 +155,9 @@ def _costs(episodes: Episodes) -> dict[str, np.ndarray]:
     return {key: costs.numpy() for key, costs in episodes.costs.items()}
 
 
-def _candidates(folder: RunFolder) -> list[Path]:
+def _candidates(run: Run) -> list[Path]:
     """Checkpoints, best and last ones, by ascending steps, one for every number of steps."""
-    kinds = (checkpoints_in(folder.checkpoints / kind) for kind in ("best", "last"))
+    kinds = (run.checkpoints(kind) for kind in ("best", "last"))
     found = {path.name: path for paths in kinds for path in paths}
     return [found[name] for name in sorted(found)]
 
@@ -216,13 +216,13 @@ def _side_by_side(policies: list[TensorDictModuleBase]) -> Callable[..., TensorD
     return policies[0] if len(policies) == 1 else act
 
 
-def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
+def _keep(run: Run, checkpoint: Path | None) -> Path | None:
     """Copy the certified checkpoint to a file that is not overwritten by later ones.
 
     The checkpoint of an earlier certificate is deleted only when the copy is complete: copying a
     checkpoint with a replay buffer takes long enough to be interrupted.
     """
-    directory = folder.checkpoints / "certified"
+    directory = run.checkpoints_folder / "certified"
     if checkpoint is None:
         shutil.rmtree(directory, ignore_errors=True)
         return None
@@ -236,7 +236,7 @@ def _keep(folder: RunFolder, checkpoint: Path | None) -> Path | None:
     return kept
 
 
-def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | None]) -> None:
+def _write(run: Run, certificate: Certificate, candidates: list[int | None]) -> None:
     verdict, options = certificate.verdict, certificate.options
     content = asdict(verdict) | asdict(options)
     content |= {
@@ -251,4 +251,4 @@ def _write(folder: RunFolder, certificate: Certificate, candidates: list[int | N
         "episodes": verdict.episodes,
         "most_episodes": options.episodes,
     }
-    replace_json(folder.certificate, content)
+    replace_json(run.certificate_file, content)

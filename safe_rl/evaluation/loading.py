@@ -14,27 +14,8 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_algorithm
-from safe_rl.files import read_config
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
-from safe_rl.runs.folder import KINDS, RunFolder
-
-
-def load_config(directory: Path) -> DictConfig:
-    """Read the resolved configuration of a run.
-
-    Raises:
-        FileNotFoundError: If the folder is not that of a run; the message names runs below it.
-        ValueError: If the configuration is not that of a run, or not resolved.
-    """
-    run = RunFolder(directory)
-    run.check_is_run()
-    config = read_config(run.config)
-    missing = {"env", "algo", "seed", "cost_limits"} - set(config)
-    if missing or not isinstance(config["env"], dict):
-        lacking = ", ".join(sorted(missing)) or "the keys of 'env'"
-        raise ValueError(f"{run.config} is not the configuration of a run: it lacks {lacking}.")
-    return OmegaConf.create(config)
+from safe_rl.runs.checkpoints import CheckpointStore
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -57,38 +38,6 @@ def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Call
     """`make_env` for evaluations of a run, with the transforms of the run if it has any."""
     transforms = transforms_of(config)
     return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
-
-
-def find_checkpoint(directory: Path, which: str) -> Path:
-    """Return the path of a run's checkpoint: "last", "best", "certified", or a path.
-
-    Raises:
-        FileNotFoundError: If there is none; the message says why and what there is.
-    """
-    if which not in KINDS:
-        if not Path(which).exists():
-            raise FileNotFoundError(
-                f"There is no checkpoint '{which}': checkpoint is last, best, certified or the "
-                "path of a file."
-            )
-        return Path(which)
-    # the newest one, even if it cannot be read: an older one must not silently replace it
-    folder = RunFolder(directory)
-    found = {kind: folder.newest_checkpoint(kind) for kind in KINDS}
-    found["best"] = best_checkpoint(folder.checkpoints / "best")
-    path = found[which]
-    if which == "last" and not folder.has_begun:  # only a policy, see `pack_policy`
-        path = path or found["certified"]
-    if path is None:
-        reason = {
-            "last": "it has not saved one yet",
-            "best": "no epoch kept every cost limit",
-            "certified": "none of its policies has been certified",
-        }
-        other = next((kind for kind, other in found.items() if other is not None), None)
-        hint = f" Use checkpoint={other}." if other else ""
-        raise FileNotFoundError(f"{directory} has no {which} checkpoint: {reason[which]}.{hint}")
-    return path
 
 
 def load_policy(

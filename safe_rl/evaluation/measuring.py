@@ -18,16 +18,15 @@ from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, StepRecorder, describe_env
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
-    find_checkpoint,
     for_evaluation,
-    load_config,
     load_policy,
     override_env,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
-from safe_rl.runs.folder import RunFolder, checkpoint_steps
+from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.run import Run
 from safe_rl.scores.benchmark import Scores, Suite
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
 from safe_rl.scores.measures import normalise
@@ -184,18 +183,18 @@ def evaluate(
         ValueError: If an option is out of its range, or the environment cannot be drawn.
     """
     check_options(options)
-    config = load_config(directory)
-    checkpoint = find_checkpoint(directory, options.checkpoint)
+    run = Run(directory)
+    config = run.config
+    checkpoint = run.find_checkpoint(options.checkpoint)
     changed = config.copy()
     changed.env = override_env(config, options.env)
     trial = Trial(changed, checkpoint, options, make_env)
     # some environments draw pictures only if this key asks for it
     drawing = {"render_mode": "rgb_array"} if "render_mode" in trial.node else {}
-    run = RunFolder(directory)
-    summary, table = (run.evaluation(options.name, kind) for kind in ("json", "csv"))
-    films = [run.evaluation(options.name, "mp4")] if options.video else []
+    summary, table = (run.evaluation_file(options.name, kind) for kind in ("json", "csv"))
+    films = [run.evaluation_file(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
-    kept = [run.evaluation(options.name, "transitions")] if options.record else []
+    kept = [run.evaluation_file(options.name, "transitions")] if options.record else []
     check_places(directory, [summary, table, *films])
     for film in films:
         with closing(trial.make(1, **drawing)) as single:

@@ -20,13 +20,14 @@ from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy, transforms_of
+from safe_rl.evaluation.loading import load_policy, transforms_of
 from safe_rl.extras import import_extra
-from safe_rl.files import read_json, read_yaml, replace_json, replacing, save_tensors
+from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
 from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
-from safe_rl.runs.folder import RunFolder, checkpoint_steps
+from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.run import Run
 
 POLICIES = Path(__file__).parents[1] / "policies"
 """A folder per environment, each with a configuration, a certificate and the policy's weights."""
@@ -69,30 +70,30 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         FileNotFoundError: If there is no such checkpoint.
         FileExistsError: If the folder has other files than an exported policy's.
     """
-    source, target = RunFolder(run), RunFolder(folder)
-    path, config = find_checkpoint(run, checkpoint), load_config(run)
+    source, target = Run(run), Run(folder)
+    path, config = source.find_checkpoint(checkpoint), source.config
     is_exported = (folder / "policy.json").is_file() and folder.resolve() != run.resolve()
     if any(folder.glob("*")) and not is_exported:
         raise FileExistsError(f"{folder} has other files: give a new folder for the policy.")
     steps = checkpoint_steps(path)
     is_certified = path.parent.name == "certified"
-    kept = target.checkpoint("certified" if is_certified else "last", steps or 0)
-    for former in (target.checkpoints, target.robot):
+    kept = target.checkpoint_file("certified" if is_certified else "last", steps or 0)
+    for former in (target.checkpoints_folder, target.robot_folder):
         shutil.rmtree(former, ignore_errors=True)
     kept.parent.mkdir(parents=True)
-    for name in (RunFolder.config, RunFolder.code, RunFolder.robot_note, RunFolder.certificate):
+    for name in (Run.config_file, Run.code_file, Run.robot_file, Run.certificate_file):
         (folder / name).unlink(missing_ok=True)  # of a policy that was exported there before
-        if (run / name).is_file() and (is_certified or name != RunFolder.certificate):
+        if (run / name).is_file() and (is_certified or name != Run.certificate_file):
             shutil.copyfile(run / name, folder / name)
-    if source.robot.is_dir() and not source.robot.is_symlink():
-        shutil.copytree(source.robot, target.robot, symlinks=True)
+    if source.robot_folder.is_dir() and not source.robot_folder.is_symlink():
+        shutil.copytree(source.robot_folder, target.robot_folder, symlinks=True)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
-    words = read_yaml(source.overrides) if source.overrides.is_file() else []
+    words = read_yaml(source.overrides_file) if source.overrides_file.is_file() else []
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
     about |= {"steps": steps, "command": shlex.join(["python", "train.py", *words])}
-    if source.code.is_file():
-        about["commit"] = read_json(source.code)[-1]["commit"]
+    if source.code:
+        about["commit"] = source.code[-1]["commit"]
     replace_json(folder / "policy.json", about)
     return kept
 
@@ -204,22 +205,22 @@ def _interface(config: DictConfig, env: EnvBase, bounds: Sequence[Tensor]) -> di
     }
 
 
-def describe(run: Path, checkpoint: Path, *, sampled: bool) -> dict[str, Any]:
+def describe(directory: Path, checkpoint: Path, *, sampled: bool) -> dict[str, Any]:
     """Where a policy comes from, for the metadata of its file; a certificate only if it covers it.
 
     Args:
-        run: Folder of the run.
+        directory: Folder of the run.
         checkpoint: The policy's weights.
         sampled: Whether its actions are sampled when it is used.
     """
-    folder, config = RunFolder(run), load_config(run)
-    found = read_json(folder.certificate) if checkpoint.parent.name == "certified" else None
+    run = Run(directory)
+    found = run.certificate if checkpoint.parent.name == "certified" else None
     covers = found is not None and is_sampled(found) == sampled
     kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
     return {
-        "algorithm": config.algo.name,
+        "algorithm": run.algorithm,
         "steps": checkpoint_steps(checkpoint),
-        "commit": read_json(folder.code)[-1]["commit"] if folder.code.is_file() else None,
+        "commit": run.code[-1]["commit"] if run.code else None,
         "certificate": {key: found.get(key) for key in kept} if found and covers else None,
     }
 

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.loading import check_env_keys, find_checkpoint, load_config, override_env
+from safe_rl.evaluation.loading import check_env_keys, override_env
 from safe_rl.evaluation.measuring import Trial, check_places, format_unjudged, summarise
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import Estimate
 
 _FACTOR = "x"
@@ -222,10 +222,11 @@ def evaluate_variations(
     """
     check_options(options)
     variations = read_variations(options.variations)
-    config = load_config(directory)
+    run = Run(directory)
+    config = run.config
     config.env = override_env(config, options.env)
-    checkpoint = find_checkpoint(directory, options.checkpoint)
-    file, picture = (RunFolder(directory).variations(options.name, kind) for kind in ("csv", "png"))
+    checkpoint = run.find_checkpoint(options.checkpoint)
+    file, picture = (run.variations_file(options.name, kind) for kind in ("csv", "png"))
     check_places(directory, [file, picture])
     for variation in variations:  # wrong keys and layouts are found before the first episode
         if not variation.may_lack and (changed := varied(config, variation)) is not None:

@@ -21,8 +21,10 @@ from safe_rl.extras import import_extra
 from safe_rl.files import read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.recorded import Run, read_certificate, read_code, read_evaluation, select
 from safe_rl.reporting.tables import clean
-from safe_rl.runs.folder import RunFolder, paths_below, runs_below
+from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import differences, role_of
+from safe_rl.runs.run import Run as RunFolder
+from safe_rl.runs.run import find_runs as find_folders
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -48,7 +50,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for path in paths_below(root, RUNS):
         with _noted(path, skipped):
             found += read_archive(path.parent).values()
-    for folder in runs_below(root):
+    for folder in find_folders(root):
         with _noted(folder.directory, skipped):
             found.append(_read_run(folder, skipped))
     runs = []
@@ -88,25 +90,25 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
                 return content
         return None
 
-    config = read_config(folder.config)
-    if not folder.table.exists():
+    config = read_config(folder.config_file)
+    if not folder.table_file.exists():
         raise ValueError("it has not begun: no progress.csv")
-    table = read_table(folder.table)
-    runtime = select(read(folder.surroundings), "hydra", "runtime")
+    table = read_table(folder.table_file)
+    runtime = select(read(folder.hydra_file), "hydra", "runtime")
     start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
     # folders of --config-dir, and of config_dir in Python
     directories = [s["path"] for s in sources if s["provider"].endswith("command-line")]
-    before = select(read(folder.composed), "frames")
+    before = select(read(folder.composed_file), "frames")
     notes = {
-        "overrides": read(folder.overrides),
+        "overrides": read(folder.overrides_file),
         # relative to the folder where the run was started, as a user would type them
         "config_dirs": [os.path.relpath(p, start) if start else p for p in directories] or None,
         "frames_before": before if before != config.get("frames") else None,
-        "certificate": read(folder.certificate, read_certificate),
-        "code": read(folder.code, read_code),
+        "certificate": read(folder.certificate_file, read_certificate),
+        "code": read(folder.code_file, read_code),
         "evaluations": [
             {key: value for key, value in found.items() if key not in ("run", "checkpoint_file")}
-            for path in folder.evaluations()
+            for path in folder.evaluation_files
             if (found := read(path, read_evaluation))
         ]
         or None,

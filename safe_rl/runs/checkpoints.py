@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
 from safe_rl.files import load_tensors, save_tensors
-from safe_rl.runs.folder import RunFolder, checkpoint_name, checkpoint_steps, checkpoints_in
+from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -259,9 +259,9 @@ class CheckpointStore:
                 ) from error
 
 
-def is_finished(directory: Path, frames: int) -> bool:
-    """Whether the newest readable checkpoint of a run was written after ``frames`` steps."""
-    for path in reversed(checkpoints_in(RunFolder(directory).checkpoints / "last")):
+def is_finished(checkpoints: Sequence[Path], frames: int) -> bool:
+    """Whether the newest readable one of a run's checkpoints was written after ``frames`` steps."""
+    for path in reversed(checkpoints):
         with suppress(CheckpointError):
             read_facts(path)
             return (checkpoint_steps(path) or 0) >= frames

@@ -13,8 +13,9 @@ from typing import Any, cast
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.files import read_config, read_yaml
-from safe_rl.runs.folder import RunFolder, common_source
+from safe_rl.files import read_yaml
+from safe_rl.runs.folder import common_source
+from safe_rl.runs.run import Run
 
 
 class Role(Enum):
@@ -181,7 +182,7 @@ def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
         directory: Folder of the run; without Hydra's notes in it there are no other settings.
         config: Configuration of the run.
     """
-    notes = RunFolder(directory).overrides
+    notes = Run(directory).overrides_file
     texts = read_yaml(notes) if notes.exists() else []
     given = {}
     for override in OverridesParser.create().parse_overrides(texts):
@@ -197,11 +198,11 @@ def check_same_run(directory: Path, config: DictConfig) -> None:
     Raises:
         ValueError: If other settings differ; the message names every key.
     """
-    run = RunFolder(directory)
+    run = Run(directory)
     if not run.is_run:
         return
     given = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    if found := differences(read_config(run.config), given):
+    if found := differences(run.settings, given):
         changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
         raise ValueError(
             f"{directory} holds a run with other settings ({changes}). Move it away, or give the "

@@ -20,7 +20,7 @@ from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 from safe_rl.checks import Text
 from safe_rl.extras import import_extra, needs_extra
 from safe_rl.files import replace_text
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 
 
 class ResumableLogger:
@@ -95,7 +95,7 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
         super().__init__(exp_name=exp_name, tracking_uri=tracking_uri)
 
     def _create_experiment(self) -> Any:
-        path = RunFolder(self._directory).logger_id("mlflow")
+        path = Run(self._directory).logger_id_file("mlflow")
         self.id = self._mlflow.set_experiment(self.exp_name).experiment_id
         run = self._mlflow.start_run(
             run_id=path.read_text() if path.exists() else None,
@@ -129,7 +129,7 @@ class WandbLogger(TorchRLWandbLogger, ResumableLogger):
         self, exp_name: Text, project: Text, offline: bool, log_dir: str, **kwargs: Any
     ) -> None:
         import_extra("wandb", extra="wandb")
-        path = RunFolder(Path(log_dir)).logger_id("wandb")
+        path = Run(log_dir).logger_id_file("wandb")
         run_id = path.read_text() if path.exists() else token_hex(4)
         replace_text(path, run_id)
         super().__init__(

@@ -23,10 +23,10 @@ from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, describe_env, make_collector
 from safe_rl.collectors.workers import MakeEnv
-from safe_rl.files import read_config
 from safe_rl.runs.checkpoints import read_states
-from safe_rl.runs.folder import RunFolder, run_of
-from safe_rl.runs.record import RunRecord
+from safe_rl.runs.folder import run_of
+from safe_rl.runs.run import Run
+from safe_rl.runs.writing import RunWriter
 from safe_rl.training.trainer import Evaluator, Trainer
 from safe_rl.trust import instantiate
 
@@ -73,14 +73,14 @@ def build_trainer(
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
-    record = RunRecord(directory, config, cost_limits, env.max_episode_steps)
-    recording = Recording(record.folder.transitions, env.cost_keys, describe_env(env))
+    writer = RunWriter(Run(directory), config, cost_limits, env.max_episode_steps)
+    recording = Recording(writer.run.transitions_folder, env.cost_keys, describe_env(env))
     return Trainer(
         env=env,
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         cost_limits=cost_limits,
-        record=record,
+        writer=writer,
         config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
         recording=recording if config.get("record") else None,
@@ -132,7 +132,7 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
     source = Path(config["init_from"])
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
-    checkpoint = RunFolder(source).newest_checkpoint() if source.is_dir() else source
+    checkpoint = Run(source).newest_checkpoint() if source.is_dir() else source
     if checkpoint is None:
         raise CheckpointError(
             f"init_from={source}: there is no checkpoint. Give the folder of a run, or a file in "
@@ -160,8 +160,8 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
 
 def _cost_critics(checkpoint: Path) -> tuple[list[str], tuple[Any, Any]]:
     """Cost keys of the cost critic in a checkpoint, empty if unknown, and what it estimates."""
-    run = RunFolder(run_of(checkpoint)[0])
-    config = read_config(run.config) if run.is_run else {}
+    run = Run(run_of(checkpoint)[0])
+    config = run.settings if run.is_run else {}
     is_constrained = (config.get("algo") or {}).get("constrained", False)
     costs = list(config.get("cost_limits", {})) if is_constrained else []
     return costs, _estimated(config)

@@ -19,7 +19,7 @@ from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
-from safe_rl.runs.record import RunRecord
+from safe_rl.runs.writing import RunWriter
 from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
 from safe_rl.training.state import (
     EnvSnapshot,
@@ -46,7 +46,7 @@ class Trainer:
         algorithm: The algorithm to train.
         collector: Endless collector of [N, T] batches with the algorithm's policy.
         cost_limits: Cost key -> d, undiscounted cost per episode, for the best checkpoints.
-        record: Writes the files of the run.
+        writer: Writes the files of the run.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Periodic evaluation of the policy, called after every epoch, or None.
         recording: Writes every batch to disk, or None.
@@ -59,7 +59,7 @@ class Trainer:
         collector: Collector | WorkerCollector,
         *,
         cost_limits: Mapping[str, float],
-        record: RunRecord,
+        writer: RunWriter,
         config: DictConfig,
         evaluation: Evaluator | None = None,
         recording: Recording | None = None,
@@ -74,7 +74,7 @@ class Trainer:
             steps_per_decision=env.steps_per_decision,
         )
         self.progress = Progress()
-        self.record = record
+        self.writer = writer
         self.episode_length = env.max_episode_steps
         self.interrupted_by: Signals | None = None
         self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
@@ -98,7 +98,7 @@ class Trainer:
     def _open_checkpoints(self, config: DictConfig) -> CheckpointStore:
         run = {"environment": config.env.name, "algorithm": config.algo.name, "seed": config.seed}
         return CheckpointStore(
-            self.record.folder.checkpoints,
+            self.writer.run.checkpoints_folder,
             self.components(),
             keep_last=config.checkpoint.keep_last,
             keep_best=config.checkpoint.get("keep_best", 1),
@@ -140,8 +140,8 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        with lock_folder(self.record.folder):
-            restored = self._checkpoints.resume(self.record.folder.num_rows)
+        with lock_folder(self.writer.run.lock_file):
+            restored = self._checkpoints.resume(self.writer.run.num_rows)
         if restored is not None:  # a run that starts over has begun its episodes already
             self._begin_episodes()
         return restored is not None
@@ -185,7 +185,7 @@ class Trainer:
             raise
         if isinstance(self._collector, WorkerCollector):
             self._collector.shutdown()
-        return self.record.summary()
+        return self.writer.summary()
 
     def close(self) -> None:
         """Close the collector with its workers, if any, and the environment."""
@@ -200,18 +200,18 @@ class Trainer:
         batches = self.batches()
         saved_at = time.monotonic()
         epoch = self.progress.epoch if self._is_continued else None
-        with StopRequest() as stop, self.record.writing(epoch, self.progress.steps):
+        with StopRequest() as stop, self.writer.writing(epoch, self.progress.steps):
             if not self.progress.epoch:
                 self._checkpoints.begin()
             if self._recording is not None:
                 # batches after the checkpoint are removed, as rows of the table are
                 self._recording.begin(self.progress.epoch)
-            self._candidates.continue_after(self.record.rows())
+            self._candidates.continue_after(self.writer.rows())
             # if the run was shorter before, these were judged by fewer epochs at its end
             self._checkpoints.forget_best(one["steps"] for one in self._candidates.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
-                self.record.add(row)
+                self.writer.add(row)
                 self._keep(self._candidates.add(row))
                 answers = [callback(row) for callback in self.callbacks]
                 # also the False of NumPy
@@ -271,7 +271,7 @@ class Trainer:
 
     def _save(self) -> None:
         self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
-        self.record.draw_curves()
+        self.writer.draw_curves()
 
     def _keep(self, judged: Iterable[Judged]) -> None:
         """Save checkpoints of the judged policies that are among the best so far."""

@@ -22,7 +22,6 @@ from safe_rl.cli.composing import compose_jobs, search_folders
 from safe_rl.cli.grammar import overrides_of
 from safe_rl.cli.python_api import _WHOLE
 from safe_rl.envs import ConfigError
-from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.reporting.archive import archive_runs, find_runs
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
@@ -195,7 +194,7 @@ def test_environments_and_algorithms_are_names(choice, tmp_path):
 
 
 def test_a_run_is_measured_against_other_limits(run):
-    path = find_checkpoint(run.directory, "last")
+    path = run.find_checkpoint("last")
     own, none = (
         run.evaluate(episodes=4, seed=5, checkpoint=path, name=name, cost_limits=limits)
         for name, limits in (("own", {}), ("none", {"cost": 0}))

@@ -7,8 +7,8 @@ from run_configs import point_mass_config
 from safe_rl.cli.composing import compose_resumed
 from safe_rl.cli.grammar import CommandLineError
 from safe_rl.cli.train import read_command
-from safe_rl.runs.folder import RunFolder
-from safe_rl.runs.record import RunRecord
+from safe_rl.runs.run import Run
+from safe_rl.runs.writing import RunWriter
 
 SAID = ["env=PointMass", "logger=none", "transforms=[]", "lagrangian=default"]
 NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\")
@@ -16,10 +16,10 @@ NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\"
 
 def begin(directory):
     config = point_mass_config("env.robot_base=point")
-    with RunRecord(directory, config, {"cost": 25.0}, 20).writing():
+    with RunWriter(Run(directory), config, {"cost": 25.0}, 20).writing():
         pass
-    RunFolder(directory).notes.mkdir()
-    RunFolder(directory).overrides.write_text(OmegaConf.to_yaml(OmegaConf.create(SAID)))
+    Run(directory).notes_folder.mkdir()
+    Run(directory).overrides_file.write_text(OmegaConf.to_yaml(OmegaConf.create(SAID)))
     return directory
 
 

@@ -38,8 +38,8 @@ def test_a_folder_that_was_named_stays(tmp_path, override):
 
 
 def test_a_folder_that_another_process_makes_first_stays(tmp_path, monkeypatch):
-    def refuse(folder):
-        folder.robot.mkdir(parents=True)
+    def refuse(file):
+        (file.parent / "robot").mkdir(parents=True)
         raise RunInUseError("in use")
 
     monkeypatch.setattr(session, "lock_folder", refuse)

@@ -20,8 +20,8 @@ from safe_rl.cli.sweeps import Sweep, count_jobs
 from safe_rl.cli.train import read_command
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.display import LINE_SECONDS, ProgressBar
-from safe_rl.runs.folder import runs_below
 from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import read_table
 
 
@@ -165,7 +165,7 @@ def test_jobs_in_other_processes_know_the_keys_of_a_users_module(tmp_path):
 
 def writers(directory):
     """Folder -> process that writes it, of the runs below a folder."""
-    return {r.directory: int(r.lock.read_text().split()[1]) for r in runs_below(directory)}
+    return {r.directory: int(r.lock_file.read_text().split()[1]) for r in find_runs(directory)}
 
 
 def wait_until(condition, seconds):
@@ -191,7 +191,7 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     ]
     first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
     try:
-        wait_until(lambda: [r.num_rows > 1 for r in runs_below(tmp_path)] == [True, True], 900)
+        wait_until(lambda: [r.num_rows > 1 for r in find_runs(tmp_path)] == [True, True], 900)
         processes = writers(tmp_path)
         again = in_a_process(*command[1:], status=1)
         for directory, pid in processes.items():
@@ -204,7 +204,7 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
         first.wait()
     wait_until(lambda: not any(map(is_running, processes.values())), 120)
     # they had the time to write what they had come to
-    for run in runs_below(tmp_path):
+    for run in find_runs(tmp_path):
         epoch = read_facts(run.newest_checkpoint())["epoch"]
         assert epoch == run.num_rows
 

@@ -15,7 +15,8 @@ from safe_rl.cli.grammar import CommandLineError, split_imports
 from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.cli.user_code import check_imports, import_modules, note_imports
 from safe_rl.envs import make_env
-from safe_rl.runs.record import RunRecord
+from safe_rl.runs.run import Run
+from safe_rl.runs.writing import RunWriter
 from safe_rl.training.building import build_trainer
 
 MODULE = """
@@ -94,7 +95,7 @@ def test_errors_are_one_line(folder, module, message):
 
 def begun_run(directory, **changes):
     """Folder of a run of somebody else's, with a configuration of theirs."""
-    with RunRecord(directory, point_mass_config(), {"cost": 25.0}, 20).writing():
+    with RunWriter(Run(directory), point_mass_config(), {"cost": 25.0}, 20).writing():
         pass
     path = directory / "config.yaml"
     OmegaConf.save(OmegaConf.merge(OmegaConf.load(path), changes), path)
@@ -137,7 +138,7 @@ def test_a_logger_leaves_no_trace(folder):
     config = OmegaConf.load(begun_run(folder / "run", logger=exec_node(folder / "trace")))
     with (
         pytest.raises(ValueError, match=r"^logger\._target_=builtins.exec"),
-        RunRecord(folder / "run", config, {"cost": 25.0}, 20).writing(epoch=0),
+        RunWriter(Run(folder / "run"), config, {"cost": 25.0}, 20).writing(epoch=0),
     ):
         pass
     assert not (folder / "trace").exists()

@@ -14,11 +14,10 @@ from run_configs import point_mass_config
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify
 from safe_rl.evaluation.certifying import _RANKING, _run, _write
-from safe_rl.evaluation.loading import find_checkpoint
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.reporting.recorded import read_certificate
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -58,7 +57,7 @@ def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
     assert written["bounds"]["mean_cost"]["bound"] < written["bounds"]["mean_cost"]["most"] == 19
     # the last two epochs, and the best three: several files may be of the same epoch
     assert len(written["candidates"]) == len(set(written["candidates"])) >= 2
-    assert find_checkpoint(directory, "certified") == certificate.checkpoint
+    assert Run(directory).find_checkpoint("certified") == certificate.checkpoint
     assert certificate.checkpoint.read_bytes()
     line = str(certificate)
     assert re.match(
@@ -91,7 +90,7 @@ def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train
     assert len(certificate.verdict.tested) == 2
     assert "mean_cost_hazards ≤ " in str(certificate)
     with pytest.raises(FileNotFoundError, match="none of its policies has been certified"):
-        find_checkpoint(directory, "certified")
+        Run(directory).find_checkpoint("certified")
 
 
 def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
@@ -107,7 +106,7 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
         patched.setattr("shutil.copy2", interrupt)
         with pytest.raises(KeyboardInterrupt):
             certify(directory, replace(OPTIONS, episodes=121), make_env=make_env)
-    assert find_checkpoint(directory, "certified") == before
+    assert Run(directory).find_checkpoint("certified") == before
     assert before.read_bytes() == content
     assert list(before.parent.iterdir()) == [before]
     for kind in ("best", "last"):
@@ -119,7 +118,7 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
     assert certify(directory, strict, make_env=make_env).checkpoint is None
     assert not json.loads((directory / "certificate.json").read_text())["certified"]
     with pytest.raises(FileNotFoundError):
-        find_checkpoint(directory, "certified")
+        Run(directory).find_checkpoint("certified")
 
 
 def test_without_limits_there_is_nothing_to_certify(train):
@@ -231,7 +230,7 @@ def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_js
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
-    _write(RunFolder(tmp_path), certificate, [100])
+    _write(Run(tmp_path), certificate, [100])
     content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
     assert content["bounds"]["mean_cost"] == {"bound": None, "most": 25.0}
     assert (content["episodes"], content["most_episodes"]) == (700, 120)

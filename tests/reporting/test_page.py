@@ -12,7 +12,7 @@ from synthetic import experiments_in, marks, texts_of, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting.inventory import evaluation_table
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
 
@@ -174,7 +174,7 @@ def test_evaluations_are_told_apart_by_their_names(tmp_path):
     estimates = {**EVALUATION["estimates"], **changes}
     for name in ("", "many"):
         content = {**EVALUATION, "estimates": estimates, "cvar_alpha": 0.005, "name": name}
-        RunFolder(directory).evaluation(name, "json").write_text(json.dumps(content))
+        Run(directory).evaluation_file(name, "json").write_text(json.dumps(content))
     table = evaluation_table(experiments_in(tmp_path))
     assert marks(table, "$J_c$") == ["", ""]
     for cells, name in zip(texts_of(table), ("", "many, "), strict=True):

@@ -9,7 +9,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.evaluation.loading import load_policy
 from safe_rl.files import load_tensors, save_tensors
-from safe_rl.runs.folder import RunFolder
+from safe_rl.runs.run import Run
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def change(folder, tmp_path, part, edit):
     """A copy of the run, its checkpoints with another state of a part."""
     run = shutil.copytree(folder, tmp_path / "run")
     trainer = point_mass_trainer(run, "frames=480")
-    for path in (RunFolder(run).checkpoints / "last").iterdir():
+    for path in (Run(run).checkpoints_folder / "last").iterdir():
         content = load_tensors(path)
         edit(content["parts"][part])
         save_tensors(path, content)
@@ -44,7 +44,7 @@ def test_a_policy_of_nan_is_not_evaluated(trained, tmp_path):
             value.fill_(torch.nan)
 
     trainer = change(trained[0], tmp_path, "actor", edit)
-    path = RunFolder(tmp_path / "run").newest_checkpoint()
-    config, env = trainer.record._config, trainer._env
+    path = Run(tmp_path / "run").newest_checkpoint()
+    config, env = trainer.writer._config, trainer._env
     with pytest.raises(CheckpointError, match="weights that are NaN or infinite"):
         load_policy(config, env, path, torch.device("cpu"))

@@ -5,8 +5,9 @@ import pytest
 from safe_rl.cli.report import ReportOptions, report
 from safe_rl.collectors import Recording
 from safe_rl.files import replace_text
-from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.loggers import TensorboardLogger
+from safe_rl.runs.run import Run
 
 MINE = "export SECRET=1"
 
@@ -38,7 +39,7 @@ def test_a_folder_with_links_is_not_written_to(place, tmp_path):
     (mine / "00000000.pt").touch()
     (run / place).parent.mkdir(parents=True)
     (run / place).symlink_to(mine)
-    with pytest.raises(ValueError, match=rf"{place} is a link"), lock_folder(RunFolder(run)):
+    with pytest.raises(ValueError, match=rf"{place} is a link"), lock_folder(Run(run).lock_file):
         pass
     assert listing(mine) == ["00000000.pt"]
 

@@ -9,7 +9,8 @@ import time
 import pytest
 from filelock import FileLock
 
-from safe_rl.runs.folder import RunFolder, RunInUseError, lock_folder
+from safe_rl.runs.folder import RunInUseError, lock_folder
+from safe_rl.runs.run import Run
 
 FORK = multiprocessing.get_context("fork")
 PATIENCE = 300
@@ -18,11 +19,11 @@ PATIENCE = 300
 
 @pytest.fixture
 def folder(tmp_path):
-    return RunFolder(tmp_path)
+    return Run(tmp_path)
 
 
 def hold(folder, ready):
-    with lock_folder(folder):
+    with lock_folder(folder.lock_file):
         ready.set()
         time.sleep(2 * PATIENCE)
 
@@ -41,19 +42,19 @@ def holder(folder):
 
 def test_the_second_is_told_who_the_first_is(folder, holder):
     with pytest.raises(RunInUseError, match=rf"process {holder.pid} on .+\. Wait"):
-        lock_folder(folder).__enter__()
+        lock_folder(folder.lock_file).__enter__()
 
 
 def test_the_lock_dies_with_its_process(folder, holder):
     os.kill(holder.pid, signal.SIGKILL)
     holder.join(PATIENCE)
-    with lock_folder(folder):
-        assert folder.lock.read_text().startswith(f"process {os.getpid()} on ")
+    with lock_folder(folder.lock_file):
+        assert folder.lock_file.read_text().startswith(f"process {os.getpid()} on ")
 
 
 def outcome_of(folder, outcome):
     try:
-        with lock_folder(folder):
+        with lock_folder(folder.lock_file):
             outcome.put("held")
     except RunInUseError:
         outcome.put("in use")
@@ -69,8 +70,8 @@ def assert_others_find(folder, expected):
 
 def test_the_outermost_block_lets_go_also_if_it_fails(folder):
     def fail():
-        with lock_folder(folder):
-            with lock_folder(RunFolder(folder.directory / ".." / folder.directory.name)):
+        with lock_folder(folder.lock_file):
+            with lock_folder(Run(folder.directory / ".." / folder.directory.name).lock_file):
                 pass
             assert_others_find(folder, "in use")
             raise FloatingPointError
@@ -89,7 +90,7 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
         time.sleep(2 * PATIENCE)
 
     def hold_and_fork(ready, child):
-        with lock_folder(folder):
+        with lock_folder(folder.lock_file):
             FORK.Process(target=outlive, args=(ready, child)).start()
             time.sleep(2 * PATIENCE)
 
@@ -100,7 +101,7 @@ def test_a_forked_process_that_outlives_the_holder_holds_nothing(folder):
         assert ready.wait(PATIENCE)
         process.kill()
         process.join()  # with a time limit, it would wait for the other one as well
-        with lock_folder(folder):
+        with lock_folder(folder.lock_file):
             pass
     finally:
         process.kill()
@@ -114,5 +115,5 @@ def test_a_file_system_without_locks_has_runs_as_well(folder, monkeypatch, code)
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(FileLock, "acquire", refuse)
-    with lock_folder(folder):
+    with lock_folder(folder.lock_file):
         pass

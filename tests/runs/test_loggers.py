@@ -16,7 +16,7 @@ def train(directory, *overrides):
     config = point_mass_config(*overrides)
     seed_everything(config.seed, 1)
     trainer = build_trainer(config, PointMass(config.num_envs, 20), directory)
-    if trainer.record.folder.has_begun:
+    if trainer.writer.run.has_begun:
         trainer.resume()
     trainer.run()
 

@@ -19,8 +19,9 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.folder import RunFolder, RunInUseError
+from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import check_same_run
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -48,7 +49,7 @@ def make_trainer(directory, *overrides, **options):
 def train(directory, *overrides, **options):
     """What the command line does: start, or continue what is there."""
     trainer = make_trainer(directory, *overrides, **options)
-    if trainer.record.folder.has_begun:
+    if trainer.writer.run.has_begun:
         trainer.resume()
     trainer.run()
 
@@ -81,7 +82,7 @@ def end_after_rows(directory, number):
 
     Another process might be too late on a busy machine.
     """
-    while RunFolder(directory).num_rows < number:
+    while Run(directory).num_rows < number:
         time.sleep(0.002)
     time.sleep(random.Random(number).uniform(0, 0.1))
     os.kill(os.getpid(), signal.SIGKILL)
@@ -128,11 +129,11 @@ def test_a_run_without_a_checkpoint_starts_over(kind, tmp_path, monkeypatch):
     whole = point_mass_trainer(tmp_path / "whole")
     whole.run()
     begun = point_mass_trainer(tmp_path / "begun")
-    with begun.record.writing():
+    with begun.writer.writing():
         begun._checkpoints.begin()
-        begun.record.add(begun.epoch(begun.batches()))
+        begun.writer.add(begun.epoch(begun.batches()))
     again = point_mass_trainer(tmp_path / "begun")
-    assert again.record.folder.has_begun
+    assert again.writer.run.has_begun
     again.resume()
     again.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("begun", "whole")]
@@ -173,7 +174,7 @@ def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path
 def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
     process = in_a_process(tmp_path, "env=PointGoal1", "frames=100_000_000")
     deadline = time.monotonic() + PATIENCE
-    while RunFolder(tmp_path).num_rows < 2:
+    while Run(tmp_path).num_rows < 2:
         assert process.is_alive()
         assert time.monotonic() < deadline
         time.sleep(0.05)
@@ -221,10 +222,10 @@ def test_tensorboard_forgets_what_is_done_again(tmp_path):
     trainer = point_mass_trainer(tmp_path, *overrides)
     trainer.run()
     # as if it had been killed in the sixth epoch, after a checkpoint in the fourth
-    with trainer.record.writing(trainer.progress.epoch, trainer.progress.steps):
+    with trainer.writer.writing(trainer.progress.epoch, trainer.progress.steps):
         for epoch in (5, 6):
             lost = dict.fromkeys(read_table(tmp_path / "progress.csv"), -1.0)
-            trainer.record.add(lost | {"epoch": epoch, "steps": 160 * epoch})
+            trainer.writer.add(lost | {"epoch": epoch, "steps": 160 * epoch})
     resumed = point_mass_trainer(tmp_path, "logger=tensorboard")
     resumed.resume()
     resumed.run()

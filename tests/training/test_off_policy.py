@@ -11,8 +11,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from safe_rl.algorithms import OffPolicy
 from safe_rl.evaluation.episodes import collect_episodes, periodic_evaluation
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.evaluation.loading import load_policy
 from safe_rl.objectives import SACLagrangianLoss
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import begin_from, build_trainer, seed_everything
 from safe_rl.trust import allow
@@ -95,7 +96,7 @@ def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
         trainer = make_trainer(f"equal{steps}", *equal, f"memory.n_steps={steps}")
         assert bool(trainer.algorithm.learns_from) == nothing
         trainer.run()
-        table = read_table(trainer.record.folder.table)
+        table = read_table(trainer.writer.run.table_file)
         assert (table["policy_num_updates"][-1] == 0) == nothing
 
 
@@ -196,8 +197,8 @@ def test_evaluation_finds_its_policy_without_what_explores(algo, make_trainer, t
     trainer = make_trainer("run", f"algo={algo}", "frames=320")
     trainer.run()
     env = PointMass(2, 20)
-    checkpoint = find_checkpoint(tmp_path / "run", "last")
-    policy = load_policy(load_config(tmp_path / "run"), env, checkpoint, torch.device("cpu"))
+    checkpoint = Run(tmp_path / "run").find_checkpoint("last")
+    policy = load_policy(Run(tmp_path / "run").config, env, checkpoint, torch.device("cpu"))
     state = env.reset()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         expected = trainer.algorithm.policy(state.clone())["action"]

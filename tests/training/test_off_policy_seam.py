@@ -15,7 +15,8 @@ from torchrl.modules import RandomPolicy
 
 from safe_rl.algorithms import Algorithm
 from safe_rl.evaluation.episodes import collect_episodes
-from safe_rl.evaluation.loading import find_checkpoint, load_config, load_policy
+from safe_rl.evaluation.loading import load_policy
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import begin_from, build_trainer, seed_everything
 from safe_rl.trust import allow
@@ -107,8 +108,8 @@ def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     taken = begin_from(second.algorithm, {"init_from": tmp_path / "run"})
     assert taken == ["explorer", "q"]
     assert torch.equal(second.algorithm.policy.bias, trainer.algorithm.policy.bias)
-    config, env = load_config(tmp_path / "run"), PointMass(2, 20)
-    checkpoint = find_checkpoint(tmp_path / "run", "last")
+    config, env = Run(tmp_path / "run").config, PointMass(2, 20)
+    checkpoint = Run(tmp_path / "run").find_checkpoint("last")
     policy = load_policy(config, env, checkpoint, torch.device("cpu"))
     assert policy.bias.tolist() == pytest.approx([0.08, 0.08])
     episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)

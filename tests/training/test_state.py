@@ -13,14 +13,14 @@ from safe_rl.training.state import RandomGenerators, StopRequest
 
 def signal_in(trainer, epoch):
     """Let a signal come while an epoch is recorded."""
-    record = trainer.record.add
+    record = trainer.writer.add
 
     def record_and_signal(row):
         record(row)
         if row["epoch"] == epoch:
             signal.raise_signal(signal.SIGTERM)
 
-    trainer.record.add = record_and_signal
+    trainer.writer.add = record_and_signal
 
 
 def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
@@ -37,8 +37,8 @@ def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
 
 def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    rows = trainer.record.rows
-    trainer.record.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
+    rows = trainer.writer.rows
+    trainer.writer.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
     trainer.run()
     assert trainer.interrupted_by is signal.SIGTERM
     assert read_table(tmp_path / "progress.csv")["epoch"] == [1]

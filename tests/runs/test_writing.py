@@ -10,9 +10,9 @@ from tensorboard.plugins.base_plugin import TBContext
 from tensorboard.plugins.hparams import metadata
 from tensorboard.plugins.hparams.backend_context import Context
 
-from safe_rl.runs.folder import RunFolder
 from safe_rl.runs.outcome import final_figures
-from safe_rl.runs.record import RunRecord
+from safe_rl.runs.run import Run
+from safe_rl.runs.writing import RunWriter
 
 NAN = math.nan
 
@@ -71,18 +71,18 @@ def test_final_figures_without_any_episode_are_nan():
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=1500",
                             "frames_per_batch=1000")  # fmt: skip
-    record = RunRecord(tmp_path / "run", config, {"cost": 25.0, "cost_north": 5.0}, 1000)
-    with record.writing():
-        record.add(row(1, NAN, NAN, NAN))
-        record.add(row(2, 1.5, 30.0, 4.0))
-    record.draw_curves()
+    writer = RunWriter(Run(tmp_path / "run"), config, {"cost": 25.0, "cost_north": 5.0}, 1000)
+    with writer.writing():
+        writer.add(row(1, NAN, NAN, NAN))
+        writer.add(row(2, 1.5, 30.0, 4.0))
+    writer.draw_curves()
     saved = OmegaConf.load(tmp_path / "run" / "config.yaml")
     assert saved == OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     events = EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
     costs = [(event.step, event.value) for event in events.Scalars("episode_cost")]
     assert costs == [(2000, 30.0)]
     assert {event.step for event in events.Scalars("multiplier_cost")} == {1000, 2000}
-    assert record.summary() == (
+    assert writer.summary() == (
         "Return 1.50, cost 30.0 (limit 25), cost_north 4.0 (limit 5) per episode, mean of steps "
         f"1,001 to 2,000; 500 steps/s; {tmp_path / 'run'}"
     )
@@ -101,13 +101,13 @@ def test_tensorboard_compares_runs_by_what_was_set(tmp_path):
     starts, finals = {}, []
     for number, overrides in enumerate(lines):
         config = compose_config(*overrides)
-        record = RunRecord(tmp_path / str(number), config, {"cost": 25.0}, 1000)
-        record.folder.notes.mkdir(parents=True)
-        OmegaConf.save(overrides, record.folder.overrides)
-        with record.writing():
+        writer = RunWriter(Run(tmp_path / str(number)), config, {"cost": 25.0}, 1000)
+        writer.run.notes_folder.mkdir(parents=True)
+        OmegaConf.save(overrides, writer.run.overrides_file)
+        with writer.writing():
             for epoch in range(1, 8):  # the final figures are means of the last five
-                record.add(row(epoch, number + epoch, 10.0 * epoch))
-        events = EventAccumulator(str(record.directory / "tensorboard")).Reload()
+                writer.add(row(epoch, number + epoch, 10.0 * epoch))
+        events = EventAccumulator(str(writer.directory / "tensorboard")).Reload()
         starts[str(number)] = events.PluginTagToContent(metadata.PLUGIN_NAME)
         finals += [events.Scalars(f"Final/episode_{name}")[-1].value for name in ("return", "cost")]
     assert finals == [5.0, 50.0, 6.0, 50.0]
@@ -130,22 +130,22 @@ def test_tensorboard_compares_runs_by_what_was_set(tmp_path):
 
 def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
     config = compose_config("env=PointMass", "logger=none")
-    record = RunRecord(tmp_path, config, {"cost": 25.0}, 1000)
-    with record.writing():
-        record.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
-        record.add(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
-    assert "cost 25.0, limited measure 88.0 (limit 25)" in record.summary()
-    with record.writing(0):
-        record.add(row(1, NAN, NAN) | {"violation_cost": NAN})
-    assert "No episode of 1,000 steps has ended, cost 1.0 (limit 25) per 1,000" in record.summary()
+    writer = RunWriter(Run(tmp_path), config, {"cost": 25.0}, 1000)
+    with writer.writing():
+        writer.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
+        writer.add(row(2, 1.0, 30.0) | {"violation_cost": 64.0})
+    assert "cost 25.0, limited measure 88.0 (limit 25)" in writer.summary()
+    with writer.writing(0):
+        writer.add(row(1, NAN, NAN) | {"violation_cost": NAN})
+    assert "No episode of 1,000 steps has ended, cost 1.0 (limit 25) per 1,000" in writer.summary()
     assert "cost=89.0/25" in capsys.readouterr().err
 
 
 def test_a_new_run_does_not_overwrite_another(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    with RunRecord(tmp_path, config, {}, 1000).writing():
+    with RunWriter(Run(tmp_path), config, {}, 1000).writing():
         pass
-    again = RunRecord(tmp_path, config, {}, 1000).writing()
+    again = RunWriter(Run(tmp_path), config, {}, 1000).writing()
     with pytest.raises(FileExistsError, match="already holds a run"):
         again.__enter__()
 
@@ -159,21 +159,21 @@ def test_what_is_killed_while_it_begins_leaves_no_table_without_a_configuration(
         raise KeyboardInterrupt
 
     config = compose_config("env=PointMass", "logger=none")
-    monkeypatch.setattr(RunRecord, "_save_config", kill)
+    monkeypatch.setattr(RunWriter, "_save_config", kill)
     with pytest.raises(KeyboardInterrupt):
-        RunRecord(tmp_path, config, {}, 1000).writing().__enter__()
-    assert not RunFolder(tmp_path).has_begun
+        RunWriter(Run(tmp_path), config, {}, 1000).writing().__enter__()
+    assert not Run(tmp_path).has_begun
 
 
 def test_writing_ends_cleanly_when_training_fails(tmp_path):
     config = compose_config("env=PointMass", "logger=none")
-    record = RunRecord(tmp_path, config, {}, 1000)
+    writer = RunWriter(Run(tmp_path), config, {}, 1000)
 
     def fail():
-        with record.writing():
-            record.add(row(1, 0.0, 0.0))
+        with writer.writing():
+            writer.add(row(1, 0.0, 0.0))
             raise FloatingPointError
 
     with pytest.raises(FloatingPointError):
         fail()
-    assert len(record.folder.table.read_text().splitlines()) == 2
+    assert len(writer.run.table_file.read_text().splitlines()) == 2

@@ -15,21 +15,22 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
-from safe_rl.runs.folder import RunFolder, lock_folder
+from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings
 from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.trust import instantiate
 
 
-class RunRecord:
-    """Configuration, table, logger, learning curves and progress bar of one run.
+class RunWriter:
+    """Writes configuration, table, logger, learning curves and progress bar of one run.
 
     The folder holds ``config.yaml`` (resolved), ``code.json`` (the commits that the run used),
     ``progress.csv`` (a row per epoch), ``curves.png`` and the files of the configured logger.
 
     Args:
-        directory: The folder; made if it does not exist.
+        run: The run; its folder is made if it does not exist.
         config: Configuration of the run.
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
@@ -40,7 +41,7 @@ class RunRecord:
 
     def __init__(
         self,
-        directory: Path,
+        run: Run,
         config: DictConfig,
         cost_limits: Mapping[str, float],
         episode_length: int,
@@ -48,8 +49,7 @@ class RunRecord:
         # imported here, so that a wrong MPLBACKEND is an error before the run begins
         import matplotlib  # noqa: F401
 
-        self.directory = directory
-        self.folder = RunFolder(directory)
+        self.run, self.directory = run, run.directory
         self._config = config
         self._cost_limits = dict(cost_limits)
         self._episode_length = episode_length
@@ -68,16 +68,16 @@ class RunRecord:
             ValueError: If the table lacks epochs of the continued run.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        with lock_folder(self.folder), ExitStack() as opened:
-            if epoch is None and self.folder.has_begun:
+        with lock_folder(self.run.lock_file), ExitStack() as opened:
+            if epoch is None and self.run.has_begun:
                 raise FileExistsError(f"{self.directory} already holds a run.")
             self._steps_before = steps
             # a continued run replaces it after its first epoch: wrong settings fail before
             self._is_config_saved = False
             # written before the table: a run without a configuration cannot be continued
-            if epoch is None or not self.folder.is_run:
+            if epoch is None or not self.run.is_run:
                 self._save_config()
-            table = TableWriter(self.folder.table, keep_rows=epoch or 0)
+            table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             self._table = opened.enter_context(table)
             self._logger = instantiate(self._config.get("logger"), log_dir=str(self.directory))
             if self._logger is not None:
@@ -100,16 +100,16 @@ class RunRecord:
     def _save_config(self) -> None:
         if not self._is_config_saved:
             # replaced atomically: a run killed here can still be continued
-            with replacing(self.folder.config) as unfinished:
+            with replacing(self.run.config_file) as unfinished:
                 OmegaConf.save(self._config, unfinished, resolve=True)
-            note_code(self.folder.code, self._steps_before)
+            note_code(self.run.code_file, self._steps_before)
             self._is_config_saved = True
 
     def _log_final(self) -> None:
         """Write the final figures to the logger, which compares runs by them."""
-        if self._logger is None or not self.folder.num_rows:
+        if self._logger is None or not self.run.num_rows:
             return
-        table = read_table(self.folder.table)
+        table = read_table(self.run.table_file)
         figures = final_figures(table, list(self._cost_limits))
         for name in ("episode_return", *(f"episode_{key}" for key in self._cost_limits)):
             if not math.isnan(figures[name]):
@@ -129,7 +129,7 @@ class RunRecord:
 
     def rows(self) -> list[dict[str, float]]:
         """The rows of the table, each by column."""
-        table = read_table(self.folder.table) if self.folder.num_rows else {}
+        table = read_table(self.run.table_file) if self.run.num_rows else {}
         return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
     def draw_curves(self) -> None:
@@ -137,14 +137,14 @@ class RunRecord:
         # imported here: matplotlib takes half a second
         from safe_rl.runs.curves import learning_curves, save_figure
 
-        table, config = read_table(self.folder.table), self._config
+        table, config = read_table(self.run.table_file), self._config
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
         figure = learning_curves(table, self._cost_limits, self._episode_length, title)
-        save_figure(figure, self.folder.curves)
+        save_figure(figure, self.run.curves_file)
 
     def summary(self) -> str:
         """One line about the end of the run."""
-        table = read_table(self.folder.table)
+        table = read_table(self.run.table_file)
         line = outcome_line(table, self._cost_limits, self._episode_length)
         return f"{line}; {self.directory}"
 

@@ -1,0 +1,364 @@
+"""A run: its folder, configuration, table, checkpoints, certificate and outcome.
+
+Training writes these files; evaluation, Python and the report read them. No other module contains
+their names.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from safe_rl.files import read_config, read_json, read_yaml
+from safe_rl.ranges import is_number
+from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
+from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.table import read_table
+
+KINDS = ("last", "best", "certified")
+"""Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
+
+
+Value = TypeVar("Value")
+
+
+class _Below:
+    """A file or folder of a run: ``run.table_file`` is its path, ``Run.table_file`` its name."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: Run | None, kind: type[Run]) -> Path:
+        return Path(self._name) if run is None else run.directory / self._name
+
+
+class _Reread(Generic[Value]):
+    """A property that is read at every use, unless the run was given its value."""
+
+    def __init__(self, read: Callable[[Any], Value]) -> None:
+        self._read = read
+        self.__doc__ = read.__doc__
+
+    def __get__(self, run: Run, kind: type[Run]) -> Value:
+        return self._read(run)
+
+
+class Run:
+    """One training run.
+
+    Contents are read when they are first asked for, without trusting the files.
+
+    Args:
+        directory: Its folder, which need not exist.
+        contents: Contents that have been read already, such as those of an archive: attribute ->
+            value.
+
+    Attributes:
+        directory: Its folder; for an archived run, its name below the archive.
+
+    Examples:
+        >>> run = Run(Path("runs/mine"), settings={"seed": 3, "cost_limits": {"cost": 25}})
+        >>> run.table_file.as_posix(), run.evaluation_file("many", "json").name
+        ('runs/mine/progress.csv', 'evaluation_many.json')
+        >>> run.seed, run.cost_limits
+        (3, {'cost': 25.0})
+    """
+
+    config_file = _Below("config.yaml")  # resolved
+    table_file = _Below("progress.csv")  # a row per epoch
+    curves_file = _Below("curves.png")  # the picture of its learning curves
+    failure_file = _Below("failure.txt")  # traceback of a failed job of a sweep
+    lock_file = _Below(".lock")  # keeps a second process from writing here; names the first
+    robot_folder = _Below("robot")  # copies of the files of a user's own robot
+    robot_file = _Below("robot.json")  # which robot that is, and its SHA-256
+    notes_folder = _Below(".hydra")  # Hydra's notes
+    overrides_file = _Below(".hydra/overrides.yaml")  # overrides of the command line
+    hydra_file = _Below(".hydra/hydra.yaml")  # Hydra's settings, and where the command was run
+    composed_file = _Below(".hydra/config.yaml")  # the configuration before it was resolved
+    code_file = _Below("code.json")  # versions of the code
+    checkpoints_folder = _Below("checkpoints")  # a folder for each of `KINDS`
+    transitions_folder = _Below("transitions")  # collected transitions, if they were recorded
+    certifying_file = _Below(".certifying")  # exists between training and certificate
+    certificate_file = _Below("certificate.json")  # which checkpoint is certified
+
+    def __init__(self, directory: Path | str, **contents: Any) -> None:
+        self.directory = Path(directory)
+        vars(self).update(contents)  # found before the cached properties of these names
+
+    # files
+
+    def checkpoint_file(self, kind: str, steps: int) -> Path:
+        """Path of the checkpoint of a kind with this number of environment steps."""
+        return self.checkpoints_folder / kind / checkpoint_name(steps)
+
+    def checkpoints(self, kind: str) -> list[Path]:
+        """Checkpoints of a kind by ascending steps, readable or not."""
+        return checkpoints_in(self.checkpoints_folder / kind)
+
+    def newest_checkpoint(self, kind: str = "last") -> Path | None:
+        """The checkpoint of a kind with most steps, readable or not; None if there is none."""
+        return next(reversed(self.checkpoints(kind)), None)
+
+    def evaluation_file(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation, by its suffix: ``json``, ``csv``, ``mp4``, ``transitions``."""
+        return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
+
+    def variations_file(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation under variations: ``csv`` the table, ``png`` the picture."""
+        return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.{suffix}"
+
+    def logger_id_file(self, logger: str) -> Path:
+        """The file with the id of this run in a logger's service."""
+        return self.directory / f"{logger}_run_id.txt"
+
+    def find_checkpoint(self, which: str) -> Path:
+        """The path of a checkpoint: "last", "best", "certified", or a path.
+
+        Raises:
+            FileNotFoundError: If there is none; the message says why and what there is.
+        """
+        if which not in KINDS:
+            if not Path(which).exists():
+                raise FileNotFoundError(
+                    f"There is no checkpoint '{which}': checkpoint is last, best, certified or the "
+                    "path of a file."
+                )
+            return Path(which)
+        from safe_rl.runs.checkpoints import best_checkpoint  # it needs torch
+
+        # the newest one, even if it cannot be read: an older one must not silently replace it
+        found = {kind: self.newest_checkpoint(kind) for kind in KINDS}
+        found["best"] = best_checkpoint(self.checkpoints_folder / "best")
+        path = found[which]
+        if which == "last" and not self.has_begun:  # only a policy, see `pack_policy`
+            path = path or found["certified"]
+        if path is None:
+            reason = {
+                "last": "it has not saved one yet",
+                "best": "no epoch kept every cost limit",
+                "certified": "none of its policies has been certified",
+            }
+            other = next((kind for kind, other in found.items() if other is not None), None)
+            hint = f" Use checkpoint={other}." if other else ""
+            raise FileNotFoundError(
+                f"{self.directory} has no {which} checkpoint: {reason[which]}.{hint}"
+            )
+        return path
+
+    @property
+    def evaluation_files(self) -> list[Path]:
+        """The files with the estimates of all evaluations."""
+        return sorted(self.directory.glob("evaluation*.json"))
+
+    @property
+    def is_run(self) -> bool:
+        """Whether a run has been set up here."""
+        return self.config_file.is_file()
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether a run has a table here."""
+        return self.table_file.exists()
+
+    @property
+    def num_rows(self) -> int:
+        """Finished epochs in the table."""
+        try:
+            lines = self.table_file.read_bytes().count(b"\n")
+        except FileNotFoundError:
+            return 0
+        return max(0, lines - 1)
+
+    def check_is_run(self) -> None:
+        """Refuse a folder that is not a run's.
+
+        Raises:
+            FileNotFoundError: If it is not; the message names runs below the folder.
+        """
+        if self.is_run:
+            return
+        below = [str(run.directory) for run in find_runs(self.directory)[:5]]
+        hint = f" Runs below it: {', '.join(below)}." if below else ""
+        raise FileNotFoundError(
+            f"{self.directory} is not the folder of a run: no {Run.config_file.name}.{hint}"
+        )
+
+    # configuration
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Its configuration as plain dictionaries.
+
+        Raises:
+            FileNotFoundError: If the folder is not that of a run.
+            ValueError: If the file is not the resolved configuration of a run.
+        """
+        self.check_is_run()
+        settings = read_config(self.config_file)
+        if wrong := ", ".join(unusable_keys(settings)):
+            raise ValueError(
+                f"{self.config_file} is not the configuration of a run: it lacks a usable {wrong}."
+            )
+        return settings
+
+    @cached_property
+    def config(self) -> DictConfig:
+        """Its whole configuration."""
+        return OmegaConf.create(self.settings)
+
+    @property
+    def seed(self) -> int:
+        """Seed of networks, layouts and actions."""
+        return self.settings["seed"]
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the algorithm, as of its file in ``conf/algo``."""
+        return self.settings["algo"]["name"]
+
+    @property
+    def environment(self) -> str:
+        """Name of the environment."""
+        return str(self.settings["env"].get("name", "environment"))
+
+    @property
+    def cost_limits(self) -> dict[str, float]:
+        """Cost key -> d, undiscounted cost per episode."""
+        return {key: float(d) for key, d in (self.settings.get("cost_limits") or {}).items()}
+
+    @property
+    def measure(self) -> str:
+        """Which measure of episode costs is limited: ``mean``, or the class of the risk measure."""
+        return measure_of(self.settings)
+
+    @property
+    def episode_length(self) -> int | None:
+        """T_ep in steps, or None if the configuration does not have it."""
+        found = (self.settings["env"].get(key) for key in ("num_steps", "max_episode_steps"))
+        return next((n for n in found if type(n) is int and n > 0), None)
+
+    @cached_property
+    def overrides(self) -> list[str] | None:
+        """Overrides of its command line, or None if they are not recorded."""
+        if not self.overrides_file.is_file():
+            return None
+        words = read_yaml(self.overrides_file)
+        return [str(word) for word in words] if isinstance(words, list) else None
+
+    # table and outcome
+
+    @cached_property
+    def table(self) -> dict[str, list[float]]:
+        """The columns of ``progress.csv``; NaN in epochs in which no episode ended."""
+        return read_table(self.table_file)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps so far."""
+        return int(self.table["steps"][-1])
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it has its configured number of steps."""
+        return self.steps >= self.settings["frames"]
+
+    @property
+    def hours(self) -> float:
+        """Time of training so far [h]."""
+        return self.table["time_total"][-1] / 3600
+
+    def column(self, name: str) -> np.ndarray:
+        """A column in the epochs in which an episode finished, shape [epochs]; NaN if missing."""
+        known = np.isfinite(self.table["episode_return"])
+        return np.array(self.table.get(name, [np.nan] * known.size), dtype=float)[known]
+
+    def figures(self, cost_keys: list[str]) -> dict[str, float]:
+        """Final J_r, J_c and ρ_c by column name (section 5.1), for the costs that it has."""
+        return final_figures(self.table, [key for key in cost_keys if f"{key}_rate" in self.table])
+
+    @property
+    def final(self) -> dict[str, float]:
+        """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``)."""
+        return self.figures(list(self.cost_limits) or ["cost"])
+
+    def excess(self, key: str) -> float:
+        """Violation of a cost's limit, a mean over the last epochs; negative within it."""
+        return violation(self.figures([key]), key, self.cost_limits[key])
+
+    # certificate, evaluations, code
+
+    @_Reread
+    def certificate(self) -> dict[str, Any] | None:
+        """The content of ``certificate.json``, or None if there is no such file."""
+        return read_json(self.certificate_file) if self.certificate_file.is_file() else None
+
+    @_Reread
+    def evaluations(self) -> list[dict[str, Any]]:
+        """The contents of the files of all evaluations."""
+        return [read_json(path) for path in self.evaluation_files]
+
+    @_Reread
+    def code(self) -> list[dict[str, Any]] | None:
+        """The versions of the code that it used, with their first steps; None if not recorded."""
+        return read_json(self.code_file) if self.code_file.is_file() else None
+
+    def command(self, *folders: str) -> str | None:
+        """The command that repeats it, or None if its overrides are not recorded."""
+        if self.overrides is None:
+            return None
+        return shlex.join(
+            ["python", "train.py", *(f"--config-dir={path}" for path in folders), *self.overrides]
+        )
+
+
+def find_runs(root: Path) -> list[Run]:
+    """Runs below a folder, itself included, in the order of their paths."""
+    folders = (path.parent for path in paths_below(root, Run.config_file.name))
+    return [Run(folder) for folder in folders if folder.name != Run.notes_folder.name]
+
+
+def measure_of(settings: Any) -> str:
+    """Which measure of episode costs a configuration limits: ``mean``, or the risk's class.
+
+    Examples:
+        >>> measure_of({"risk": {"_target_": "safe_rl.objectives.CVaR"}}), measure_of({})
+        ('CVaR', 'mean')
+    """
+    target = (settings.get("risk") or {}).get("_target_") or "mean"
+    return str(target).rpartition(".")[2]
+
+
+def unusable_keys(settings: dict[str, Any]) -> list[str]:
+    """Keys of a configuration that are missing, or that no run would have like this.
+
+    Examples:
+        >>> good = {"env": {}, "algo": {"name": "cpo"}, "seed": 0, "cost_limits": {"cost": 25}}
+        >>> unusable_keys(good), unusable_keys(good | {"import": 5, "algo": 3})
+        ([], ['algo', 'import'])
+    """
+    env, algo = settings.get("env"), settings.get("algo")
+    limits, frames = settings.get("cost_limits"), settings.get("frames", 0)
+    modules = settings.get("import") or []
+    groups = ("transforms", "risk", "checkpoint", "certificate", "collector", "hydra")
+    usable = {
+        "env": isinstance(env, dict) and _is_name(env.get("name", "")),
+        "algo": isinstance(algo, dict) and _is_name(algo.get("name", 0)),
+        "seed": type(settings.get("seed")) is int,
+        "cost_limits": isinstance(limits, dict) and all(map(is_number, limits.values())),
+        "frames": is_number(frames) and frames >= 0,
+        "import": isinstance(modules, list) and all(isinstance(name, str) for name in modules),
+        "init_from": isinstance(settings.get("init_from"), str | None),
+        **{key: isinstance(settings.get(key), dict | None) for key in groups},
+    }
+    return [key for key, is_usable in usable.items() if not is_usable]
+
+
+def _is_name(value: Any) -> bool:
+    """Whether a value is a name, which as a part of a path cannot lead out of a folder."""
+    return isinstance(value, str) and not value.startswith("/") and ".." not in value.split("/")
