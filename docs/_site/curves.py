@@ -1,13 +1,7 @@
-"""Learning curves from results/: of an algorithm for its page, of five environments for README.
-
-Pages get theirs when the site is built. ``python docs/_site/curves.py`` draws those of README,
-docs/holding_the_limit.png, again.
-"""
+"""``python docs/_site/curves.py`` draws docs/holding_the_limit.png again, from results/."""
 
 from __future__ import annotations
 
-import tempfile
-from functools import cache
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -16,7 +10,7 @@ from PIL import Image
 
 from safe_rl.cli.report import suite
 from safe_rl.reporting.archive import find_runs
-from safe_rl.reporting.curves import draw_experiment, draw_learning_curves, limits_of, set_axes
+from safe_rl.reporting.curves import draw_experiment, limits_of, set_axes
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import LIMIT_STYLE, add_legend, algorithm_styles
 from safe_rl.runs.curves import save_figure
@@ -24,40 +18,12 @@ from safe_rl.runs.curves import save_figure
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@cache
-def pictures() -> dict[str, bytes]:
-    """Algorithm -> its learning curves, every environment a row, with 95 % intervals over seeds.
-
-    Seeds of other settings have curves of their own.
-    """
-    experiments = archived("algorithms")
-    styles = algorithm_styles(experiments)
-    made = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for algo in dict.fromkeys(e.runs[0].algorithm for e in experiments):
-            shown = [e for e in experiments if e.runs[0].algorithm == algo]
-            figure = draw_learning_curves(shown, styles)
-            made[algo] = save_figure(figure, Path(folder) / f"{algo}.png").read_bytes()
-    return made
-
-
-def curves(algo: str) -> str:
-    """The picture of an algorithm; nothing for one that has not run."""
-    said = f"Return, episode cost and cost rate of {algo} on PointGoal1 and CarGoal1"
-    return f"![{said}]({algo}.png)" if algo in pictures() else ""
-
-
-def draw_readme() -> None:
-    """Draw what README shows."""
-    held = archived("held_out")
+def draw() -> None:
+    """Draw the picture."""
+    held = group_runs(find_runs(ROOT / "results" / "held_out")[0], suite())[0]
     picture = save_figure(draw_columns(held), ROOT / "docs" / "holding_the_limit.png")
     # a third of the bytes: so many bands over one another have no more colours than fit a palette
     Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
-
-
-def archived(campaign: str) -> list[Experiment]:
-    """Experiments of a campaign in results/."""
-    return group_runs(find_runs(ROOT / "results" / campaign)[0], suite())[0]
 
 
 def draw_columns(experiments: list[Experiment]) -> Figure:
@@ -87,4 +53,4 @@ def draw_columns(experiments: list[Experiment]) -> Figure:
 
 
 if __name__ == "__main__":
-    draw_readme()
+    draw()

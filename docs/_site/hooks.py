@@ -2,46 +2,65 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-import api
-import campaigns
-import catalogue
-import curves
 import equations
 import links
-import navigation
+import marks
 from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files, InclusionLevel
+from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
+# packages that people import from: each has a page, by its `__all__`
+API = {
+    "safe_rl": "In notebooks and scripts",
+    "safe_rl.envs": "Environments",
+    "safe_rl.envs.extending": "Adding to environments",
+    "safe_rl.envs.transforms": "Transforms",
+    "safe_rl.envs.velocity": "Velocity limits",
+    "safe_rl.objectives": "Losses, advantages, multipliers, limits",
+    "safe_rl.objectives.cpo_dual": "CPO's dual",
+    "safe_rl.objectives.trust_region": "Trust regions",
+    "safe_rl.objectives.fisher": "Fisher-vector products",
+    "safe_rl.objectives.risk": "Risk measures",
+    "safe_rl.algorithms": "Algorithms, updates, steps",
+    "safe_rl.models": "Networks",
+    "safe_rl.collectors": "Collection and accounting",
+    "safe_rl.evaluation": "Evaluation and certificates",
+    "safe_rl.scores.certificate": "Claims and their bounds",
+    "safe_rl.scores.comparisons": "Intervals",
+    "safe_rl.scores.measures": "Normalised scores",
+    "safe_rl.reporting": "Reports",
+    "safe_rl.runs.table": "Tables of runs",
+}
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """Complete the navigation by what is found and made."""
+    """Complete the navigation by the algorithms' pages, each by its heading, and the API."""
     sections = {name: pages for entry in config.nav or [] for name, pages in entry.items()}
-    algorithms = sections["Algorithms"]
-    algorithms += navigation.unlisted(algorithms, ROOT / "docs" / "algorithms")
-    sections["API"] += [{name: page} for page, name in api.PAGES.items()]
+    listed = str(sections["Algorithms"])
+    for path in sorted((ROOT / "docs" / "algorithms").glob("*.md")):
+        if f"algorithms/{path.name}" not in listed:
+            heading = re.search(r"^# (.+)$", path.read_text(), re.M)[1]  # type: ignore[index]
+            sections["Algorithms"].append({f"{path.stem}: {heading}": f"algorithms/{path.name}"})
+    sections["API"] += [{module: f"api/{module}.md"} for module in API]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add the pages that are made, and those of files that pages link to."""
-    shown = {page: links.read_page(ROOT / source) for page, source in links.PAGES.items()}
-    made = api.pages() | shown
-    drawn = {f"algorithms/{algo}.png": picture for algo, picture in curves.pictures().items()}
-    for uri, content in (made | drawn | {"report.html": campaigns.report()}).items():
+    """Add the pages of the API, and those of files elsewhere."""
+    rows = "".join(f"| [`{m}`]({m}.md) | {what} |\n" for m, what in API.items())
+    made = {"api/index.md": f"# API\n\n| import from | for |\n|---|---|\n{rows}"}
+    made |= {f"api/{module}.md": f"# {module}\n\n::: {module}\n" for module in API}
+    made |= {page: links.read_page(ROOT / source) for page, source in links.PAGES.items()}
+    for uri, content in made.items():
         files.append(File.generated(config, uri, content=content))
-    texts = {page.src_uri: page.content_string for page in files.documentation_pages()}
-    for uri, text in links.linked_files(texts, ROOT).items():
-        page = File.generated(config, uri, content=text, inclusion=InclusionLevel.NOT_IN_NAV)
-        files.append(page)
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Put tables in, and lead links to files outside of `docs/` to their pages."""
-    return links.rewrite(catalogue.fill(markdown), page.file.src_uri, ROOT)
+    return links.rewrite(marks.fill(markdown), page.file.src_uri, ROOT)
 
 
 def on_page_content(content: str, **_: object) -> str:

@@ -314,6 +314,19 @@ def fill_readme(text: str) -> str:
     return re.sub(f"(?<={mark})(\\|.*\n)+", lambda _: readme() + "\n", text)
 
 
+TABLES = (
+    held_out,
+    rivals,
+    paper_preset,
+    coverage,
+    compared,
+    measured,
+    single,
+    parts,
+    velocity_runs,
+)
+
+
 if __name__ == "__main__":
     page = ROOT / "README.md"
     page.write_text(fill_readme(page.read_text()))

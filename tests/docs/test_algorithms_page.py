@@ -2,7 +2,7 @@
 
 import re
 
-import algorithm_pages
+import marks
 import pytest
 from made import ALGORITHMS, DOCS, columns_of
 from omegaconf import OmegaConf
@@ -21,7 +21,7 @@ OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
 
 
 def test_every_algorithm_is_in_the_lists():
-    lists = "".join(algorithm_pages.listed(r) for r in re.findall(r"made: listed (\w+)", PAGE))
+    lists = "".join(marks.listed(r) for r in re.findall(r"made: listed (\w+)", PAGE))
     assert all(f"| [`{algo}`]({algo}.md) |" in lists for algo in ALGORITHMS)
 
 

@@ -1,15 +1,14 @@
-"""What the site makes: tables of the environments, links out of `docs/`, its navigation."""
+"""What the site makes: tables, links out of `docs/`, its navigation."""
 
 import re
 from pathlib import Path
 
-import catalogue
+import environment_tables
 import links
-import navigation
+import marks
 import pytest
 import yaml
 
-from safe_rl.cli.schema import KEYS
 from safe_rl.envs import SUITE, key_table
 from safe_rl.envs.safety_gym.costs import COSTS
 
@@ -23,61 +22,53 @@ def cells(page):
 
 
 def test_every_key_has_its_row_below_a_heading():
-    page = catalogue.keys()
+    page = environment_tables.keys()
     assert {row.name for row in key_table()} <= set(cells(page))
-    assert (
-        "| a number above 0 and at most 1e+09 | `0.3` | radius [m] |" in cells(page)["hazards_size"]
-    )
+    assert "| `0.3` | radius [m] |" in cells(page)["hazards_size"]
     assert page.index("## Hazards") < page.index("`hazards_size`") < page.index("## Vases")
 
 
-def test_every_key_of_a_run_has_its_row_with_its_default():
-    rows = cells(catalogue.run_keys())
-    assert set(KEYS) <= set(rows)
-    assert {"clip_epsilon", "betas", "kp", "tail", "num_collectors", "budgets"} <= set(rows)
-    level = "| a number above 0.5 and below 1 | `0.95` | confidence of a certificate |"
-    assert level in rows["certificate.level"]
-    assert "| `256` |" in rows["batch_size"]  # which only off-policy algorithms have
-
-
 def test_every_environment_and_cost_has_its_row():
-    rows = cells(catalogue.benchmark())
+    rows = cells(environment_tables.benchmark())
     assert set(SUITE) <= set(rows)
     assert "| 60 | 2 | `cost_hazards` |" in rows["PointGoal1"]
-    assert {row.key for row in COSTS} == set(catalogue.COST_MEANINGS) - {"cost", "cost_exception"}
-    assert {row.key for row in COSTS} <= set(cells(catalogue.costs()))
+    meanings = set(environment_tables.COST_MEANINGS) - {"cost", "cost_exception"}
+    assert {row.key for row in COSTS} == meanings
+    assert {row.key for row in COSTS} <= set(cells(environment_tables.costs()))
 
 
 def test_every_component_of_the_observation_is_explained():
-    rows = cells(catalogue.observations())
+    rows = cells(environment_tables.observations())
     assert "| 3 | any | m/s² |" in rows["accelerometer"]
     assert "[0, 1]" in rows["…_lidar"]
     with pytest.raises(KeyError, match="smell"):
-        catalogue.component_of("smell")
+        environment_tables.component_of("smell")
 
 
 def test_pages_ask_for_every_table():
     pages = "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
-    assert set(re.findall(r"<!-- made: (\w+)", pages)) == set(catalogue.TABLES)
-    assert catalogue.fill("a\n<!-- made: lidars -->\nb").count("`observe_hazards`") == 1
+    assert set(re.findall(r"<!-- made: (\w+)", pages)) == set(marks.TABLES)
+    assert marks.fill("a\n<!-- made: lidars -->\nb").count("`observe_hazards`") == 1
 
 
-def test_links_to_files_outside_lead_to_their_pages(tmp_path):
-    (tmp_path / "conf" / "b").mkdir(parents=True)
-    (tmp_path / "conf" / "b" / "c.yaml").touch()
-    (tmp_path / "conf" / "a.yaml").write_text("x: 1\n")
-    text = "[a](../../conf/a.yaml) [all](../../conf#top) [gone](../../conf/b.yaml) [p](other.md)"
-    pages = links.linked_files({"guides/x.md": text}, tmp_path)
-    assert set(pages) == {"files/conf/a.yaml.md", "files/conf/b/c.yaml.md", "files/conf.md"}
-    assert "x: 1" in pages["files/conf/a.yaml.md"]
-    assert "(conf/a.yaml.md)" in pages["files/conf.md"]
-    below = links.linked_files({"x.md": "[b](../conf/b)"}, tmp_path)
-    assert "(b/c.yaml.md)" in below["files/conf/b.md"]
-    led = links.rewrite(text, "guides/x.md", tmp_path)
-    assert led == (
-        "[a](../files/conf/a.yaml.md) [all](../files/conf.md#top) "
-        "[gone](../../conf/b.yaml) [p](other.md)"
+def test_files_of_conf_are_shown_as_they_are():
+    shown = marks.conf("algo/cpo.yaml config.yaml")
+    assert (ROOT / "conf" / "algo" / "cpo.yaml").read_text() in shown
+    assert 'title="conf/config.yaml"' in shown
+    with pytest.raises(AssertionError, match="nosuch"):
+        marks.conf("algo/nosuch.yaml")
+
+
+def test_links_to_files_outside_lead_to_their_pages_or_are_their_names(tmp_path):
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "a.yaml").touch()
+    text = (
+        "[a](../../conf/a.yaml) [gone](../../conf/b.yaml) [p](other.md) [c](../../CHANGELOG.md#x)"
     )
+    assert links.rewrite(text, "guides/x.md", tmp_path) == (
+        "a [gone](../../conf/b.yaml) [p](other.md) [c](../changelog.md#x)"
+    )
+    assert links.rewrite("[s](../docs/start.md)", "campaigns.md", tmp_path) == "[s](start.md)"
 
 
 def test_equations_become_mathml_or_an_error():
@@ -93,18 +84,6 @@ def test_equations_become_mathml_or_an_error():
     assert 'display="block"' in made
     with pytest.raises(ValueError, match="nosuch"):
         typeset(r'<span class="arithmatex">\(\nosuch x\)</span>')
-
-
-def test_pages_that_the_navigation_does_not_list_are_found_with_their_titles(tmp_path):
-    for name in ("b", "a", "listed", "titled"):
-        (tmp_path / f"{name}.md").write_text(
-            f"<!-- a mark -->\n# Heading of {name}\n\n# Not this\n"
-        )
-    listed = [f"{tmp_path.name}/listed.md", {"A title": f"{tmp_path.name}/titled.md"}]
-    assert navigation.unlisted(listed, tmp_path) == [
-        {"a: Heading of a": f"{tmp_path.name}/a.md"},
-        {"b: Heading of b": f"{tmp_path.name}/b.md"},
-    ]
 
 
 def test_every_page_is_in_the_navigation_once():

@@ -1,0 +1,211 @@
+"""Tables on the environments, made from those that the program itself goes by."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import mujoco
+from result_tables import table
+
+from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
+from safe_rl.envs.safety_gym.config_keys import Vocabulary
+from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
+from safe_rl.envs.safety_gym.elements import ELEMENTS
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
+
+_NAMES = ("Point", "Car", "Doggo")
+_ROBOTS = Path(inspect.getfile(SafetyGymEnv)).parent / "robots"
+# pattern of names -> unit, meaning, and keys that turn these components of the observation on
+COMPONENTS = {
+    "accelerometer": ("m/s²", "acceleration of the robot's frame, gravity included", ""),
+    "velocimeter": ("m/s", "velocity in the robot's frame", ""),
+    "gyro": ("rad/s", "angular velocity in the robot's frame", ""),
+    "magnetometer": ("field", "the field (0, −0.5, 0) in the robot's frame", ""),
+    "touch_.*": ("N", "force on a foot", "sensors_obs"),
+    "ballangvel_.*": ("rad/s", "angular velocity of a ball joint", "sensors_ball_joints"),
+    "ballquat_.*": ("1", "rotation matrix of a ball joint, 3 × 3", "sensors_ball_joints"),
+    "jointvel_.*": ("rad/s", "speed of a hinge", "sensors_hinge_joints"),
+    "jointpos_.*": ("1", "sine and cosine of a hinge's angle", "sensors_hinge_joints"),
+    ".*_lidar": (
+        "1",
+        "closeness of the nearest object by direction: 1 at it, 0 if too far",
+        "observe_<kind>, lidar_num_bins",
+    ),
+    ".*_compass": (
+        "1",
+        "direction to the object in the robot's frame, a unit vector",
+        "observe_goal_comp, observe_box_comp",
+    ),
+    "goal_dist": ("1", "e to the minus distance to the goal [m]", "observe_goal_dist"),
+    "remaining": ("1", "share of the episode's steps taken so far", "observe_remaining"),
+    "com": ("m", "the robot's centre of mass, in the frame of the world", "observe_com"),
+    "ctrl": ("1", "the last control", "observe_ctrl"),
+    "freejoint": ("m, 1", "position and quaternion of a free root", "observe_freejoint"),
+    "qpos": ("m, rad, 1", "positions of all joints (`qpos` of MuJoCo)", "observe_qpos"),
+    "qvel": ("m/s, rad/s", "velocities of all joints (`qvel` of MuJoCo)", "observe_qvel"),
+    "vision": ("1", "image of the robot's camera, height × width × 3", "observe_vision"),
+}
+COST_MEANINGS = {
+    "cost": "any of the others is",
+    "cost_hazards": "the robot's centre is in a hazard; size: depth [m]",
+    "cost_vases_contact": "the robot touches vases; size: number of contact points",
+    "cost_vases_displace": "vases have been moved since the reset; size: distance [m]",
+    "cost_vases_velocity": "vases move; size: speed [m/s]",
+    "cost_pillars": "the robot touches pillars; size: number of contact points",
+    "cost_buttons": "the robot touches a wrong button, not just after a goal; size: contact points",
+    "cost_gremlins": "the robot touches gremlins; size: number of contact points",
+    "cost_boundary": "the robot's centre is outside of a boundary; size: distance [m]",
+    "cost_velocity": "the robot is faster than `velocity_limit`; size: excess [m/s]",
+    EXCEPTION_KEY: "the physics failed, and the episode ended",
+}
+
+
+def benchmark() -> str:
+    """The 27 environments."""
+    return _suite_table(SUITE)
+
+
+def debug() -> str:
+    """Circle and Run, free and within boundaries."""
+    return _suite_table(name for name in EXTRAS if not name.endswith("Vision"))
+
+
+def _suite_table(names: Iterable[str]) -> str:
+    rows = []
+    for name in names:
+        env = SafetyGymEnv(name, num_envs=1)
+        kinds = [f"`{key}`" for key in env.cost_keys if key not in ("cost", EXCEPTION_KEY)]
+        objects = {e.kind: e.count((SUITE | EXTRAS)[name]) for e in ELEMENTS}
+        there = [f"{n} {kind if n > 1 else kind[:-1]}" for kind, n in objects.items() if n]
+        rows.append([f"`{name}`", *_sizes(env), ", ".join(kinds) or "none", ", ".join(there)])
+    return table(["`env=`", "size of observation", "size of action", "costs", "objects"], rows)
+
+
+def _sizes(env: SafetyGymEnv | VelocityEnv) -> tuple[int, int]:
+    columns = env.observation_layout.values()
+    return max(part.stop for part in columns), env.action_spec.shape[-1]
+
+
+def velocity() -> str:
+    """The family of velocity limits."""
+    rows = [
+        [
+            f"`{name}`",
+            f"{name.removeprefix('Safe').removesuffix('Velocity')}-v5",
+            f"{config.velocity_threshold:g}",
+            *_sizes(VelocityEnv(config, num_envs=1)),
+        ]
+        for name, config in VELOCITY_SUITE.items()
+    ]
+    sizes = ["size of observation", "size of action"]
+    return table(["`env=`", "Gymnasium's id", "threshold [m/s]", *sizes], rows)
+
+
+def keys() -> str:
+    """Every key of an environment, by what it is about: the comments of the vocabulary."""
+    source = inspect.getsource(Vocabulary)
+    heading = {key: name for name, key in re.findall(r"\n    # ([^\n]+)\n    (\w+):", source)}
+    groups: dict[str, list[Sequence[str]]] = {}
+    for row in key_table():
+        if row.name in heading:
+            groups[heading[row.name]] = []
+        cells = (f"`{row.name}`", row.values, f"`{row.default}`", row.meaning)
+        next(reversed(groups.values())).append(cells)
+    head = ["key", "allowed values", "default", "meaning"]
+    return "\n\n".join(f"## {n.capitalize()}\n\n{table(head, rows)}" for n, rows in groups.items())
+
+
+def observations() -> str:
+    """Components of the observation: sizes, ranges, units, meaning."""
+    found: dict[str, tuple[int, tuple[float, float], set[str]]] = {}
+    for label, env in _observed():
+        for name, columns in env.observation_layout.items():
+            known = (columns.stop - columns.start, env.observation_bounds[name], set[str]())
+            found.setdefault(name, known)[2].add(label)
+    rows = []
+    for pattern, (unit, meaning, told) in COMPONENTS.items():
+        for shown, group in _alike([name for name in found if component_of(name) == pattern]):
+            size, (low, high), _ = found[group[0]]
+            bound = "any" if math.isinf(high) else f"[{low:g}, {high:g}]"
+            flags = ", ".join(f"`{key}`" for key in told.split(", ") if key)
+            who = set().union(*(found[name][2] for name in group))
+            everyone = "any" in who or len(who) == len(_NAMES)
+            of = "all" if everyone else ", ".join(name for name in _NAMES if name in who)
+            rows.append((f"`{shown}`", size, bound, unit, meaning, flags, of))
+    return table(["component", "size", "range", "unit", "meaning", "keys", "robots"], rows)
+
+
+def component_of(name: str) -> str:
+    """The pattern in `COMPONENTS` that explains a component.
+
+    Raises:
+        KeyError: If there is none.
+    """
+    found = [pattern for pattern in COMPONENTS if re.fullmatch(pattern, name)]
+    if not found:
+        raise KeyError(f"docs/_site/environment_tables.py explains no component '{name}'")
+    return found[0]
+
+
+def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
+    """Environments in which every component of the observation occurs."""
+    for robot in _NAMES:
+        for name in ("Goal2", "Button2", "Push2", "Circle"):
+            yield robot, SafetyGymEnv(f"{robot}{name}", num_envs=1)
+    shown = ("goal_comp", "box_comp", "goal_dist", "remaining", "com", "ctrl", "qpos", "qvel")
+    everything = {f"observe_{name}": True for name in shown}
+    everything |= {"task": "push", "observation_flatten": True}
+    yield "any", SafetyGymEnv(everything | {"robot_base": "point"}, num_envs=1)
+    yield "Car", SafetyGymEnv(everything | {"robot_base": "car", "observe_freejoint": True}, 1)
+    seeing = {"robot_base": "point", "task": "goal", "observe_vision": True}
+    yield "any", SafetyGymEnv(seeing, num_envs=1)
+
+
+def _alike(names: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Names that differ in numbers and ends only, under one: `touch_ankle_<…>`."""
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        stem = re.sub(r"(?<=_)\d.*$|^.*(?=_(lidar|compass)$)", "…", name)
+        groups.setdefault(stem, []).append(name)
+    return list(groups.items())
+
+
+def lidars() -> str:
+    """Keys that turn lidars on."""
+    return ", ".join(f"`{element.flag or 'observe_' + element.kind}`" for element in ELEMENTS) + "."
+
+
+def costs() -> str:
+    """Costs, their keys and their sizes."""
+    flags = {row.key: f"`constrain_{row.key.split('_')[1]}`" for row in COSTS}
+    names = ("cost", *(row.key for row in COSTS), EXCEPTION_KEY)
+    rows = [(f"`{key}`", COST_MEANINGS[key], flags.get(key, "always there")) for key in names]
+    return table(["cost", "it is positive if", "switched on by"], rows)
+
+
+def robots() -> str:
+    """Actuators and sensors of the robots that come with the package, from their files."""
+    text = []
+    for name in _NAMES:
+        model = mujoco.MjModel.from_xml_path(str(_ROBOTS / f"{name.lower()}.xml"))
+        actuators = [
+            (f"`{model.actuator(i).name}`", "[{:g}, {:g}]".format(*model.actuator_ctrlrange[i]))
+            for i in range(model.nu)
+        ]
+        sizes = {model.sensor(i).name: model.sensor_dim[i] for i in range(model.nsensor)}
+        sensors = [(f"`{shown}`", len(g), sizes[g[0]]) for shown, g in _alike([*sizes])]
+        text += [
+            f"## {name}",
+            f"{model.nu} actuators, {model.nv} degrees of freedom, "
+            f"{float(model.body_subtreemass[0]):.3g} kg.",
+            table(["actuator", "range of the control"], actuators),
+            table(["sensor", "number", "size of each"], sensors),
+        ]
+    return "\n\n".join(text)
+
+
+TABLES = (benchmark, debug, velocity, keys, observations, lidars, costs, robots)

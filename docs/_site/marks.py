@@ -1,0 +1,68 @@
+"""What pages ask for: `<!-- made: name words -->` becomes a table or a file of the program."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import environment_tables
+import result_tables
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = ROOT / "docs" / "algorithms"
+_MARK = re.compile(r"<!-- made: (\w+) ?(.*?) -->")
+_HEAD = "| `algo=` | problem it solves | policy step | source |\n|---|---|---|---|"
+
+
+def conf(names: str) -> str:
+    """Files of ``conf/`` as they are: their comments explain every key."""
+    paths = [path for name in names.split() for path in sorted((ROOT / "conf").glob(name))]
+    assert paths, f"there is no conf/{names}"
+    blocks = [
+        f'```yaml title="conf/{path.relative_to(ROOT / "conf")}"\n{path.read_text()}```'
+        for path in paths
+    ]
+    return "\n\n".join(blocks)
+
+
+def listed(kind: str) -> str:
+    """Problem, policy step and source of the algorithms of a kind, as their pages say."""
+    rows = []
+    for page in sorted(PAGES.glob("*.md")):
+        short = re.search(r"^<!-- row: (.*) -->$", text := page.read_text(), re.M)
+        source = re.search(r"^`algo=\w+` · (.*)$", text, re.M)
+        has_buffer = re.search(r"made: columns .*memory", text) is not None
+        if short and source and has_buffer == (kind == "OffPolicy"):
+            rows.append(f"| [`{page.stem}`]({page.name}) | {short[1]} | {source[1]} |")
+    return "\n".join([_HEAD, *rows])
+
+
+def columns(names: str) -> str:
+    """Rows of the tables of columns.md, named by `<!-- table: columns of … -->`."""
+    text = (PAGES / "columns.md").read_text() + "\n"
+    tables = [
+        re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", text, re.DOTALL)[1]  # type: ignore[index]
+        for name in names.split()
+    ]
+    rows = [row for table in tables for row in table.splitlines()[2:]]
+    return "\n".join(["| column | meaning |", "|---|---|", *rows])
+
+
+TABLES: dict[str, Callable[..., str]] = {
+    table.__name__: table
+    for table in (
+        *(conf, listed, columns),
+        *environment_tables.TABLES,
+        *result_tables.TABLES,
+    )
+}
+
+
+def fill(markdown: str) -> str:
+    """Put the tables where a page asks for them.
+
+    Raises:
+        KeyError: If there is no such table.
+    """
+    return _MARK.sub(lambda match: TABLES[match[1]](*filter(None, [match[2]])), markdown)
