@@ -14,7 +14,6 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
 PAGE = (DOCS / "algorithms" / "index.md").read_text()
-OFF_POLICY_PAGE = (DOCS / "off_policy.md").read_text()
 COLUMNS_PAGE = (DOCS / "algorithms" / "columns.md").read_text() + "\n"
 LIMITED = ["cost_hazards", "cost_north"]
 OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
@@ -87,16 +86,3 @@ def test_costs_are_estimated_as_rewards_are_but_for_what_the_table_says():
         config = compose_config(f"preset={preset}", "algo=cpo", "env=PointMass")
         same = ("gamma", "value_target", *own)
         assert all(config.cost_advantage[key] == config.advantage[key] for key in same)
-
-
-def test_the_defaults_of_off_policy_algorithms_are_those_of_the_files():
-    config = compose_config("algo=sac_lagrangian", "env=PointMass")
-    known = {}
-    for keys, default in re.findall(r"^\| (`.+?) \| ([^|]+) \|", OFF_POLICY_PAGE, re.MULTILINE):
-        known |= dict(
-            zip(re.findall(r"`([^`]+)`", keys), re.split(r", (?!0)", default), strict=True)
-        )
-    assert len(known) > 9
-    for key, default in known.items():
-        value = OmegaConf.create(f"value: {default.strip().replace(',', '')}").value
-        assert OmegaConf.select(config, key) == value, key
