@@ -53,11 +53,11 @@ def restored(run: Path, directory: Path):
 
 
 def collect(trainer, number: int) -> list:
-    """Batches of the present policy with what constraints charge for each step."""
+    """Batches of the present policy, with penalised costs if a risk measure is limited."""
     batches, found = trainer.batches(), []
     for _ in range(number):
         batch = next(batches).clone()
-        trainer.algorithm.constraints.apply_risk(trainer.accounting.update(batch), batch)
+        trainer.algorithm.constraints.update(batch, trainer.accounting.update(batch))
         found.append(batch)
     return found
 

@@ -1,11 +1,10 @@
 """A constrained loss and a risk measure of your own.
 
 - `QuadraticPenaltyLoss` is PPO's loss plus a penalty: the square of the amount by which the
-  predicted J_c exceeds its limit. Its constructor has an argument `constraints`, so it gets this
-  object of the run.
+  predicted J_c exceeds its target. `self.limits` is the state of the limits after the last batch.
 - `UpperSemideviation` limits E[C] + w E[(C − E[C])₊], the mean cost of an episode plus w times the
-  mean excess of costly episodes (Ruszczyński and Shapiro 2006). It computes the charge of each
-  step, which replaces its cost; advantages, critics and limits use the charges.
+  mean excess of costly episodes (Ruszczyński and Shapiro 2006). It computes a penalised
+  cost of each step, which replaces its cost for advantages, critics and limits.
 
 The files in `conf/` beside this one name these classes:
 
@@ -22,8 +21,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.objectives import PPOLoss, RiskMeasure
-from safe_rl.objectives.risk import Charges, cost_so_far
-from safe_rl.objectives.violation import constraint_value, violation_of
+from safe_rl.objectives.risk import PenalisedCosts, cost_so_far
 
 
 class QuadraticPenaltyLoss(PPOLoss):
@@ -32,21 +30,20 @@ class QuadraticPenaltyLoss(PPOLoss):
     extra_out_keys = ("loss_penalty", "clip_fraction")
     has_costs = True
 
-    def __init__(self, actor_network, constraints, *, strength: float, **settings) -> None:
+    def __init__(self, actor_network, *, strength: float, **settings) -> None:
         super().__init__(actor_network, **settings)
-        self.constraints, self.strength = constraints, strength
+        self.strength = strength
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)  # [k]
-        violation = violation_of(self.constraints, surrogates)
-        excess = surrogates + constraint_value(violation, self.constraints.episode_length, True)
+        excess = self.limits.excess(surrogates)  # predicted, above the target, per time step
         penalty = self.strength * excess.relu().square().sum()
         return super()._surrogates(tensordict, log_weight) | {"loss_penalty": penalty}
 
 
 class UpperSemideviation(RiskMeasure):
-    """Charges whose mean over episodes is E[C] + w E[(C − m)₊], m the running mean of C."""
+    """Penalised costs of mean E[C] + w E[(C − m)₊], m the running mean of C."""
 
     state_names = ("_mean",)  # what checkpoints keep of it
 
@@ -54,12 +51,14 @@ class UpperSemideviation(RiskMeasure):
         self.limits, self.weight, self.memory = cost_limits, weight, memory
         self._mean = torch.full_like(cost_limits, torch.inf)  # no episode is above it yet
 
-    def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
-        """Charge the steps of a batch: see `safe_rl.objectives.RiskMeasure`."""
+    def __call__(
+        self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
+    ) -> PenalisedCosts:
+        """Compute the penalised costs of a batch: see `safe_rl.objectives.RiskMeasure`."""
         if len(finished):
             mean = finished.float().mean(0)
             known = self._mean.isfinite()
             self._mean = torch.where(known, torch.lerp(mean, self._mean, self.memory), mean)
         beyond = (cost_so_far(costs, ends, before) - self._mean).clamp_min(0)
-        charged = costs + self.weight * torch.minimum(costs, beyond)
-        return Charges(charged, offset=torch.zeros_like(self.limits), limit=self.limits)
+        penalised = costs + self.weight * torch.minimum(costs, beyond)
+        return PenalisedCosts(penalised, offset=torch.zeros_like(self.limits), limit=self.limits)

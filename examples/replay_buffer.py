@@ -2,9 +2,10 @@
 
     python examples/replay_buffer.py --env PointGoal1 --frames 200_000
 
-Only networks, loss, multiplier and episode accounting are from this package. The complete algorithm
-is `train.py algo=sac_lagrangian`: it also has pessimistic costs (`loss.pessimism`), a limit that
-falls during training, checkpoints, evaluations and a table.
+Only networks, loss, multiplier, limits and episode accounting are from this package. Multiplier and
+loss get the state of the limits after every batch, so that λ has the same scale as in `train.py
+algo=sac_lagrangian limits/replay@limits=paper`. The complete algorithm also has pessimistic costs
+(`loss.pessimism`), a limit that falls during training, checkpoints, evaluations and a table.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
+from safe_rl.algorithms import Constraints
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.models import QEnsemble, make_squashed_actor
@@ -58,6 +60,7 @@ def main(arguments: list[str] | None = None) -> list[dict[str, float]]:
     torch.manual_seed(args.seed)
     env = SafetyGymEnv(args.env, num_envs=args.num_envs, seed=args.seed)
     loss, multiplier = make_loss(env, args.limit)
+    constraints = Constraints({"cost": args.limit}, max_length=env.max_episode_steps)
     collector = Collector(
         env,
         loss.actor_network,
@@ -73,8 +76,9 @@ def main(arguments: list[str] | None = None) -> list[dict[str, float]]:
     rows = []
     for batch in collector:
         episodes = accounting.update(batch)
-        if episodes.num_episodes:
-            multiplier.update(episodes.mean_costs(["cost"]) - multiplier.limits)
+        limits = constraints.update(batch, episodes)
+        multiplier.update(limits)
+        loss.prepare(batch, limits)
         buffer.extend(batch.reshape(-1))
         for _ in range(args.updates_per_batch):
             losses = loss(buffer.sample())

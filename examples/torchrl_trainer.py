@@ -86,7 +86,8 @@ def ppo_lagrangian_trainer(
             gae=parts.advantages,
             progress_bar=False,
         )
-    ConstraintHook(Constraints(limits, multiplier=multiplier), parts.accounting).register(trainer)
+    told = {"multiplier": multiplier, "loss": policy_loss}
+    ConstraintHook(Constraints(limits), parts.accounting, **told).register(trainer)
     return trainer
 
 
@@ -95,7 +96,7 @@ def cpo_trainer(
 ) -> Trainer:
     """TorchRL's trainer with a CPO step in place of its optimiser."""
     parts = Parts(env, limits, frames_per_batch)
-    constraints = Constraints(limits)
+    hook = ConstraintHook(Constraints(limits), parts.accounting)
     policy_loss = CPOLoss(parts.actor, entropy_coeff=0.0)
     step = CPOStep(
         policy_loss,
@@ -118,10 +119,10 @@ def cpo_trainer(
         frame_skip=1,
         optim_steps_per_batch=1,
         loss_module=ActorCriticLoss(policy_loss, parts.critic_loss, critic_coeff=1.0),
-        optimization_stepper=UpdateStepper(step, critic_update, constraints),
+        optimization_stepper=UpdateStepper(step, critic_update, hook),
         progress_bar=False,
     )
-    ConstraintHook(constraints, parts.accounting).register(trainer)
+    hook.register(trainer)
     ValueEstimatorHook(parts.advantages).register(trainer)
     return trainer
 

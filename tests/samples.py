@@ -1,5 +1,7 @@
 """Small batches, actors and critics shared by the objective tests."""
 
+from dataclasses import replace
+
 import torch
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
@@ -7,6 +9,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from safe_rl.objectives import LimitState
 from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import flatten, set_parameters
 
@@ -52,6 +55,12 @@ def make_batch(actor, batch_size, num_costs=1):
     if num_costs:
         batch["cost_advantage"] = 3 * torch.randn(*batch_size, num_costs)
     return batch
+
+
+def limit_state(*violation, length=100.0, unit=None):
+    """The state of limits whose violations are these, exactly; every scale is 1."""
+    state = LimitState.of(cost=violation, limit=[0.0] * len(violation), length=length)
+    return state if unit is None else replace(state, unit=torch.tensor(unit))
 
 
 def whole_step(step, batch, *given):

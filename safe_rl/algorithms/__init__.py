@@ -1,9 +1,9 @@
 """Algorithms: gradient updates, trust-region steps, and how they are built."""
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate, SequentialUpdates
+from safe_rl.algorithms.algorithm_contract import Algorithm, PolicyUpdate
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.cpo_step import CPOStep, PCPOStep
-from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
+from safe_rl.algorithms.minibatch import CUPUpdate, KLAdaptiveRate, MinibatchUpdate
 from safe_rl.algorithms.off_policy import OffPolicy
 from safe_rl.algorithms.on_policy import OnPolicy
 from safe_rl.algorithms.processor_use import fast_products
@@ -17,6 +17,7 @@ __all__ = [
     "CPOStep",
     "CRPOStep",
     "CTRPOStep",
+    "CUPUpdate",
     "Constraints",
     "KLAdaptiveRate",
     "Memory",
@@ -26,7 +27,6 @@ __all__ = [
     "PCPOStep",
     "PolicyUpdate",
     "ReplayUpdate",
-    "SequentialUpdates",
     "TRPOStep",
     "fast_products",
 ]

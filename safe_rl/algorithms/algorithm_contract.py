@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.checks import Checked
 from safe_rl.collectors import EpisodeStatistics
+from safe_rl.objectives import LimitState
 from safe_rl.resumable import Resumable
 
 
@@ -120,76 +121,16 @@ class PolicyUpdate(Checked, Resumable, ABC):
 
     @abstractmethod
     def __call__(
-        self,
-        batch: TensorDictBase,
-        cost_violation: Tensor | None = None,
-        episode_length: Tensor | None = None,
+        self, batch: TensorDictBase, limits: LimitState | None = None
     ) -> Mapping[str, Tensor]:
         """Improve the policy on ``batch`` and return diagnostics.
 
         Args:
             batch: On-policy data with advantages, any batch shape.
-            cost_violation: Amount by which J_c must fall, for every constraint, [k]: J_c − d, or
-                J_c minus the current target (column ``target_…``) if the limit falls during
-                training.
-            episode_length: Mean episode length T̄ in steps, a scalar.
+            limits: State of the limits after this batch, as `Constraints.update` returns it; None
+                if there are no limits.
         """
 
     def loss_modules(self) -> Mapping[str, nn.Module]:
         """Losses that are modules, by name. Checkpoints save their state beside the networks."""
         return {}
-
-
-class SequentialUpdates(PolicyUpdate):
-    """Several updates, one after the other, as a single `PolicyUpdate`.
-
-    In a configuration, ``then`` names what comes after ``policy_update``: a loss and an update for
-    each of any number of names (see ``conf/algo/cup.yaml``).
-
-    Args:
-        first: The first update; its diagnostics keep their names.
-        then: The other updates, in order. Their diagnostics are called ``<name>_…``.
-            ``cost_surrogate`` is that of the last update that reports one.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> class Fixed(PolicyUpdate):
-        ...     def __init__(self, kl):
-        ...         self.kl = torch.tensor(kl)
-        ...     def __call__(self, batch, cost_violation, episode_length):
-        ...         return {"kl": self.kl}
-        >>> update = SequentialUpdates(Fixed(0.01), {"projection": Fixed(0.02)})
-        >>> update(TensorDict(), torch.zeros(1), torch.ones(()))
-        {'kl': tensor(0.0100), 'projection_kl': tensor(0.0200)}
-    """
-
-    state_names = ("first", "then")
-
-    def __init__(self, first: PolicyUpdate, then: Mapping[str, PolicyUpdate]) -> None:
-        self.first, self.then = first, dict(then)
-
-    def __call__(
-        self,
-        batch: TensorDictBase,
-        cost_violation: Tensor | None = None,
-        episode_length: Tensor | None = None,
-    ) -> dict[str, Tensor]:
-        """Take all updates on one batch; see `PolicyUpdate`."""
-        given = (batch, cost_violation, episode_length)
-        metrics = dict(self.first(*given))
-        for name, update in self.then.items():
-            reported = dict(update(*given))
-            predicted = reported.pop("cost_surrogate", None)
-            metrics |= {f"{name}_{key}": value for key, value in reported.items()}
-            if predicted is not None:
-                metrics["cost_surrogate"] = predicted
-        return metrics
-
-    def loss_modules(self) -> dict[str, nn.Module]:
-        """Losses of all updates; those after the first are called ``loss.<name>``."""
-        found = dict(self.first.loss_modules())
-        for name, update in self.then.items():
-            for place, loss in update.loss_modules().items():
-                found[f"loss.{name}{place.removeprefix('loss')}"] = loss
-        return found

@@ -10,7 +10,8 @@ from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm
-from safe_rl.algorithms.constraints import Constraints, TrackedConstraints, check_cost_limits
+from safe_rl.algorithms.constraints import Constraints, check_cost_limits
+from safe_rl.objectives import Multiplier
 from safe_rl.trust import TargetError, instantiate, locate
 
 _DEFAULT = "safe_rl.algorithms.OnPolicy"
@@ -59,40 +60,34 @@ def constrained_limits(config: DictConfig, env: EnvBase, *, otherwise: str) -> d
     return limits
 
 
+def build_multiplier(
+    config: DictConfig, limits: dict[str, float], device: torch.device
+) -> Multiplier | None:
+    """The multiplier that a configuration names, or None."""
+    multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
+    return None if multiplier is None else multiplier.to(device)
+
+
 def build_constraints(
     config: DictConfig, limits: dict[str, float], env: EnvBase, device: torch.device
 ) -> Constraints:
-    """Constraints with the multiplier, tracker and risk measure that a configuration names.
+    """Constraints with the tracker and risk measure that a configuration names.
 
     Lengths of episodes are in decisions (time steps of a batch), schedules in environment steps.
 
     Raises:
         ValueError: If a risk measure is named without a tracker.
     """
-    multiplier = risk = None
-    per_decision = env.steps_per_decision
-    max_length = math.ceil(env.max_episode_steps / per_decision)
-    if config.get("lagrangian") is not None:
-        multiplier = instantiate(config.lagrangian, cost_limits=limits).to(device)
+    max_length = math.ceil(env.max_episode_steps / env.steps_per_decision)
+    if not limits:
+        return Constraints({}, max_length=max_length, device=device)
     values = torch.tensor(list(limits.values()))
-    if limits and _names_a_part(config.get("risk")):
-        risk = instantiate(config.risk, {"steps_per_decision": per_decision}, cost_limits=values)
-    if limits and _names_a_part(config.get("limits")):
-        tracker = instantiate(
-            config.limits,
-            {"max_length": max_length, "steps_per_decision": per_decision},
-            cost_limits=values,
-        )
-        return TrackedConstraints(
-            limits, tracker=tracker, multiplier=multiplier, risk=risk, device=device
-        )
-    if risk is not None:
+    known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
+    risk = instantiate(config.get("risk"), known, cost_limits=values)
+    tracker = instantiate(config.get("limits"), known, cost_limits=values)
+    if risk is not None and tracker is None:
         raise ValueError(
             "risk: only the mean cost is limited by the episodes of a batch alone (limits=paper); "
             "other measures need limits=default."
         )
-    return Constraints(limits, max_length=max_length, multiplier=multiplier, device=device)
-
-
-def _names_a_part(node: DictConfig | None) -> bool:
-    return node is not None and node.get("_target_") is not None
+    return Constraints(limits, max_length=max_length, tracker=tracker, risk=risk, device=device)

@@ -14,7 +14,6 @@ from torch import Tensor
 from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.trust_region import flat_gradient
-from safe_rl.objectives.violation import constraint_value
 
 #: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
 _NO_GRADIENT = 1e-8
@@ -31,8 +30,8 @@ class CPOStep(TRPOStep):
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
-        rescale_violation: Whether to divide the violations by the episode length; see
-            `constraint_value`.
+        rescale_violation: Whether to divide the violations by the episode length: b is the gradient
+            of an average per time step, so c has to be one too.
         largest_demand: Upper bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the largest
             decrease of the surrogate within the trust region; None: no bound. Without a bound, a
             policy far above its limit takes recovery steps (case 0), which ignore the reward, until
@@ -43,7 +42,7 @@ class CPOStep(TRPOStep):
     Examples:
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss
+        >>> from safe_rl.objectives import CPOLoss, LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
@@ -51,7 +50,8 @@ class CPOStep(TRPOStep):
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
         >>> settings = {"rescale_violation": True, "damping": 0.1, **search}
         >>> step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
-        >>> step(batch, torch.tensor([-25.0]), torch.tensor(50.0))["case"]
+        >>> state = LimitState.of(cost=[0.0], limit=[25.0], length=50.0)
+        >>> step(batch, state)["case"]
         tensor(3)
     """
 
@@ -102,7 +102,9 @@ class CPOStep(TRPOStep):
 
     def _linearised(self, problem: StepProblem) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
-        c = constraint_value(problem.violation, problem.length, self.rescale_violation)
+        c = problem.required_decrease
+        if self.rescale_violation:
+            c = (c / problem.length).nan_to_num(nan=0.0)
         loss = total_loss(problem.losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         return g, self._gradients(problem.surrogates), c
@@ -180,7 +182,7 @@ class PCPOStep(CPOStep):
     Examples:
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss
+        >>> from safe_rl.objectives import CPOLoss, LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
@@ -188,7 +190,7 @@ class PCPOStep(CPOStep):
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
         >>> settings = {"projection": "kl", "rescale_violation": True, "damping": 0.1, **search}
         >>> step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
-        >>> metrics = step(batch, torch.tensor([-1e6]), torch.tensor(50.0))
+        >>> metrics = step(batch, LimitState.of(cost=[0.0], limit=[1e6], length=50.0))
         >>> metrics["nu"]  # far inside, TRPO's step
         tensor([0.])
     """

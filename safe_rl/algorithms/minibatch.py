@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -22,7 +22,10 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
-from safe_rl.checks import Share
+from safe_rl.checks import Share, Weight
+from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.policy_projections import CUPLoss
 from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.ranges import PART
@@ -90,7 +93,7 @@ class MinibatchUpdate(PolicyUpdate):
 
     If the KL exceeds ``max_kl`` before the first step, because a very different policy collected
     the batch, and ``step_beyond_kl`` is not set, no step is taken and a warning says so. Before the
-    first step, the method ``anchor`` of a `SurrogateLoss` is called with the batch.
+    first step, the method ``prepare`` of a `SurrogateLoss` gets the batch and the limits.
 
     Args:
         loss: Loss module. It gets the entries of the batch that its ``in_keys`` name, and the
@@ -155,10 +158,7 @@ class MinibatchUpdate(PolicyUpdate):
         self._generator = torch.Generator().manual_seed(torch.initial_seed())
 
     def __call__(
-        self,
-        batch: TensorDictBase,
-        cost_violation: Tensor | None = None,
-        episode_length: Tensor | None = None,
+        self, batch: TensorDictBase, limits: LimitState | None = None
     ) -> dict[str, Tensor]:
         """Take the gradient steps on ``batch``, of any shape; padding is not used.
 
@@ -171,7 +171,7 @@ class MinibatchUpdate(PolicyUpdate):
         history: list[TensorDictBase] = []
         num_steps = 0
         if isinstance(self.loss, SurrogateLoss):
-            self.loss.anchor(batch)
+            self.loss.prepare(batch, limits)
         samples = self._samples(batch)
         for minibatch in self._minibatches(samples):
             total, losses = self._evaluate(minibatch)
@@ -257,3 +257,70 @@ class MinibatchUpdate(PolicyUpdate):
     def loss_modules(self) -> dict[str, nn.Module]:
         """The loss."""
         return {"loss": self.loss}
+
+
+class CUPUpdate(MinibatchUpdate):
+    """The two updates of CUP (Yang et al. 2022): one for the reward, then a projection.
+
+    The first minimises the given loss, usually `PPOLoss`. The second minimises a `CUPLoss`, which
+    lowers the costs near the policy that the first has reached. Diagnostics of the projection are
+    called ``projection_…``, except for ``cost_surrogate``.
+
+    Args:
+        loss: Loss of the first update.
+        multiplier: Multiplier with one ν per cost.
+        gamma: Discount γ of the cost advantages.
+        lmbda: Decay λ_GAE of the TD errors in the cost advantages.
+        settings: Those of both updates, see `MinibatchUpdate`. The projection's learning rate is
+            constant: with ν = 0 its KL stays small, and the rate would only rise.
+
+    Examples:
+        >>> from functools import partial
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import LimitState, PPOLoss, ProjectedMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
+        >>> update = CUPUpdate(
+        ...     PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0),
+        ...     ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0),
+        ...     gamma=0.99,
+        ...     lmbda=0.97,
+        ...     optimizer=partial(torch.optim.Adam, lr=1e-3),
+        ...     num_passes=2,
+        ...     minibatch_size=None,
+        ... )
+        >>> state = LimitState.of(cost=[30.0], limit=[25.0])
+        >>> update(batch, state)["projection_num_steps"]
+        tensor(2)
+    """
+
+    state_names = (*MinibatchUpdate.state_names, "projection")
+
+    def __init__(
+        self,
+        loss: SurrogateLoss,
+        multiplier: Multiplier,
+        *,
+        gamma: Weight,
+        lmbda: Share,
+        **settings: Any,
+    ) -> None:
+        super().__init__(loss, **settings)
+        actor = loss.actor_network
+        projection = CUPLoss(actor, multiplier, gamma=gamma, lmbda=lmbda, entropy_coeff=0.0)
+        self.projection = MinibatchUpdate(projection, **(settings | {"adapt_rate": None}))
+
+    def __call__(
+        self, batch: TensorDictBase, limits: LimitState | None = None
+    ) -> dict[str, Tensor]:
+        """Take both updates on a batch; see `MinibatchUpdate`."""
+        metrics = super().__call__(batch, limits)
+        projected = self.projection(batch, limits)
+        predicted = {"cost_surrogate": projected.pop("cost_surrogate")}
+        return metrics | {f"projection_{k}": v for k, v in projected.items()} | predicted
+
+    def loss_modules(self) -> dict[str, nn.Module]:
+        """The losses of both updates."""
+        return {"loss": self.loss, "loss.projection": self.projection.loss}

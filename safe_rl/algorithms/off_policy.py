@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
-from safe_rl.algorithms.build_part import build_constraints, constrained_limits
+from safe_rl.algorithms.build_part import build_constraints, build_multiplier, constrained_limits
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.off_policy_networks import bounded_actions, build_networks, exploring
@@ -22,6 +22,7 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy
+from safe_rl.objectives import Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
@@ -34,8 +35,9 @@ class OffPolicy(Resumable, Algorithm):
     Attributes:
         policy: Exploring policy, with the actor's parameters.
         networks: Actor, critic and, with constraints, cost critic.
-        constraints: Costs, limits and multiplier. Multipliers follow the undiscounted costs of
-            episodes, not the discounted critics.
+        constraints: Costs and limits.
+        multiplier: Multiplier that weighs costs against the return, or None. It follows the
+            undiscounted costs of episodes, not the discounted critics.
         replay_buffer: The replay buffer.
         policy_update: Trains all networks on minibatches.
         random_steps: Environment steps with random actions at the beginning, 0 if nothing is
@@ -52,6 +54,7 @@ class OffPolicy(Resumable, Algorithm):
     policy: ExploringPolicy
     networks: Mapping[str, nn.Module]
     constraints: Constraints
+    multiplier: Multiplier | None
     replay_buffer: Memory
     policy_update: ReplayUpdate
     random_steps: int
@@ -78,15 +81,15 @@ class OffPolicy(Resumable, Algorithm):
         device = torch.device(config.device)
         networks = build_networks(config, env, len(limits), device)
         constraints = build_constraints(config, limits, env, device)
+        multiplier = build_multiplier(config, limits, device)
         loss = instantiate(
             config.loss,
             {
                 "qvalue_network": networks.get("critic"),
                 "cost_qvalue_network": networks.get("cost_critic"),
                 "action_spec": bounded_actions(env).to(device),
-                "multiplier": constraints.multiplier,
+                "multiplier": multiplier,
                 "cost_keys": constraints.keys,
-                "constraints": constraints,
                 "cost_limits": limits,
             },
             actor_network=networks["actor"],
@@ -107,6 +110,7 @@ class OffPolicy(Resumable, Algorithm):
             policy=exploring(networks["actor"], env, config.exploration.noise),
             networks=networks,
             constraints=constraints,
+            multiplier=multiplier,
             replay_buffer=buffer,
             policy_update=update,
             random_steps=random_steps,
@@ -153,12 +157,14 @@ class OffPolicy(Resumable, Algorithm):
         Returns:
             Values for columns of the table, by name.
         """
-        constraints = self.constraints
+        constraints, multiplier = self.constraints, self.multiplier
+        row: dict[str, float] = {}
         if constraints.keys:
-            constraints.apply_risk(episodes, batch)
-            constraints.update(episodes, batch)
-            self.policy_update.loss.calibrate(constraints)
-            self.policy_update.loss.measure(batch["next", "reward"])
+            limits = constraints.update(batch, episodes)
+            if multiplier is not None:
+                multiplier.update(limits)
+            self.policy_update.loss.prepare(batch, limits)
+            row = constraints.columns(limits, multiplier)
         bias = self.policy_update.loss.cost_bias(batch)
         if self.collects:
             self.replay_buffer.extend(batch)
@@ -166,7 +172,6 @@ class OffPolicy(Resumable, Algorithm):
         self._count_steps(steps)
         needed = max(self.random_steps // self.steps_per_decision, self.replay_buffer.batch_size)
         number = self.policy_update.due(steps) if len(self.replay_buffer) >= needed else 0
-        row = constraints.columns()
         row |= {} if bias is None else constraints.column("critic_bias", bias)
         for name, value in self.policy_update(self.replay_buffer, number).items():
             row |= constraints.column(f"policy_{name}", value)
@@ -193,7 +198,7 @@ class OffPolicy(Resumable, Algorithm):
         """Parts with a state, by name; the replay buffer only with ``memory.keep``."""
         parts: dict[str, Stateful | None] = {
             **self.networks,
-            "multiplier": self.constraints.multiplier,
+            "multiplier": self.multiplier,
             "policy_update": self.policy_update,
             "algorithm": self,
             "memory": self.replay_buffer if self.replay_buffer.keeps else None,

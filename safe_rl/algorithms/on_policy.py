@@ -17,16 +17,15 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import (
     Algorithm,
     PolicyUpdate,
-    SequentialUpdates,
     Stateful,
 )
-from safe_rl.algorithms.build_part import build_constraints, constrained_limits
-from safe_rl.algorithms.constraints import CHARGES, Constraints
+from safe_rl.algorithms.build_part import build_constraints, build_multiplier, constrained_limits
+from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
-from safe_rl.objectives import CriticLoss, JointAdvantages
+from safe_rl.objectives import CriticLoss, JointAdvantages, LimitState, Multiplier
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
 from safe_rl.trust import TargetError, instantiate
@@ -40,7 +39,8 @@ class OnPolicy(Algorithm):
         actor: Policy with ``get_dist``.
         critic: Writes ``state_value``, [..., 1].
         cost_critic: Writes ``cost_value``, [..., k]; None if the algorithm has no constraints.
-        constraints: Costs, limits and multiplier.
+        constraints: Costs and limits.
+        multiplier: Multiplier that weighs costs against the return, or None.
         advantage: Estimator of the reward advantage, with the critic.
         cost_advantage: Estimator of the cost advantages, with the cost critic, or None.
         policy_update: Improves the actor.
@@ -51,6 +51,7 @@ class OnPolicy(Algorithm):
     critic: TensorDictModule
     cost_critic: TensorDictModule | None
     constraints: Constraints
+    multiplier: Multiplier | None
     advantage: VectorGAE
     cost_advantage: CostGAE | None
     policy_update: PolicyUpdate
@@ -81,23 +82,24 @@ class OnPolicy(Algorithm):
         networks = _build_networks(config, env, len(limits), device)
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
         constraints = build_constraints(config, limits, env, device)
+        multiplier = build_multiplier(config, limits, device)
         cost_advantage = None
         if limits:
             cost_advantage = instantiate(
                 config.cost_advantage,
-                {"cost_limits": constraints.held_limits},
+                {"cost_limits": constraints.measured_limits},
                 value_network=cost_critic,
                 cost_keys=constraints.keys,
             )
-            constraints.cost_advantage = cost_advantage.tensor_keys.advantage
             if constraints.risk is not None:
-                cost_advantage.set_keys(reward=[CHARGES])
+                cost_advantage.set_keys(reward=[PENALISED_COSTS])
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
+            multiplier=multiplier,
             advantage=instantiate(config.advantage, value_network=critic),
             cost_advantage=cost_advantage,
-            policy_update=_policy_update(config, networks, constraints),
+            policy_update=_policy_update(config, networks, constraints, multiplier),
             critic_update=instantiate(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 
@@ -119,18 +121,19 @@ class OnPolicy(Algorithm):
         Returns:
             Values for columns of the table, by name.
         """
-        constraints = self.constraints
-        constraints.apply_risk(episodes, batch)
+        constraints, multiplier = self.constraints, self.multiplier
+        limits = constraints.update(batch, episodes)
+        if multiplier is not None:
+            multiplier.update(limits)
         JointAdvantages(self.advantage, self.cost_advantage)(batch)
         bias = self._critic_bias(batch)
-        constraints.update(episodes, batch)
-        metrics = self._update(batch)
-        constraints.record_prediction(metrics["policy"])
+        metrics = self._update(batch, limits)
+        constraints.record_prediction(limits, metrics["policy"])
         take_in(self.networks.values(), batch)
-        row = constraints.columns() | bias
-        for part, values in metrics.items():
+        row = constraints.columns(limits, multiplier) | bias
+        for network, values in metrics.items():
             for name, value in values.items():
-                row |= constraints.column(f"{part}_{name}", torch.as_tensor(value))
+                row |= constraints.column(f"{network}_{name}", torch.as_tensor(value))
         return row
 
     def _critic_bias(self, batch: TensorDictBase) -> dict[str, float]:
@@ -144,10 +147,9 @@ class OnPolicy(Algorithm):
         bias = critic_bias(batch[keys.value], costs, *ends, estimator.gamma)
         return self.constraints.column("critic_bias", bias)
 
-    def _update(self, batch: TensorDictBase) -> dict[str, Mapping[str, Tensor]]:
+    def _update(self, batch: TensorDictBase, limits: LimitState) -> dict[str, Mapping[str, Tensor]]:
         """Improve the policy and fit the critics, in parallel where they are independent."""
-        violation, length = self.constraints.violation, self.constraints.episode_length
-        improve = partial(self.policy_update, batch, violation, length)
+        improve = partial(self.policy_update, batch, limits)
         fit = partial(self.critic_update, batch)
         both = (improve(), fit()) if self._shares_critics() else in_parallel(improve, fit)
         return {"policy": both[0], "critic": both[1]}
@@ -161,7 +163,7 @@ class OnPolicy(Algorithm):
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a state, by name."""
-        multiplier = self.constraints.multiplier
+        multiplier = self.multiplier
         kept = [*self.networks.values(), *([] if multiplier is None else [multiplier])]
         parts: dict[str, Stateful | None] = {
             **self.networks,
@@ -187,21 +189,20 @@ def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
 
 
 def _policy_update(
-    config: DictConfig, networks: Mapping[str, Any], constraints: Constraints
+    config: DictConfig,
+    networks: Mapping[str, Any],
+    constraints: Constraints,
+    multiplier: Multiplier | None,
 ) -> PolicyUpdate:
-    """The update of the policy: ``policy_update`` on ``loss``, then the pairs in ``then``."""
+    """The update of the policy: ``policy_update`` on ``loss``."""
     optional = {  # what a loss or an update of a user may take as well
         "critic_network": networks["critic"],
-        "constraints": constraints,
-        "multiplier": constraints.multiplier,
+        "multiplier": multiplier,
         "cost_keys": constraints.keys,
-        "cost_limits": constraints.held_limits,
+        "cost_limits": constraints.measured_limits,
     }
     loss = instantiate(config.loss, optional, actor_network=networks["actor"])
-    update = instantiate(config.policy_update, optional, loss=loss)
-    then = config.get("then") or {}
-    others = {str(name): _policy_update(pair, networks, constraints) for name, pair in then.items()}
-    return SequentialUpdates(update, others) if others else update
+    return instantiate(config.policy_update, optional, loss=loss)
 
 
 def _build_networks(

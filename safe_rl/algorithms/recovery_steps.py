@@ -70,7 +70,7 @@ class CTRPOStep(TRPOStep):
     Examples:
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss
+        >>> from safe_rl.objectives import CPOLoss, LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
@@ -80,9 +80,8 @@ class CTRPOStep(TRPOStep):
         >>> barrier = {"beta": 0.1, "hysteresis": 0.8}
         >>> loss = CPOLoss(actor, entropy_coeff=0.0)
         >>> step = CTRPOStep(loss, {"cost": 25.0}, **barrier, **region, **search)
-        >>> length = torch.tensor(1000.0)
-        >>> violations = [torch.tensor([violation]) for violation in (1, -1, -6)]
-        >>> [step(batch, violation, length)["recovers"].item() for violation in violations]
+        >>> states = [LimitState.of(cost=[c], limit=[25.0], length=1000.0) for c in (26, 24, 19)]
+        >>> [step(batch, state)["recovers"].item() for state in states]
         [1.0, 1.0, 0.0]
     """
 
@@ -104,7 +103,8 @@ class CTRPOStep(TRPOStep):
         self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
 
     def _propose(self, problem: StepProblem) -> Proposal:
-        surrogates, violation, length = problem.surrogates, problem.violation, problem.length
+        surrogates, length = problem.surrogates, problem.length
+        violation = problem.required_decrease
         is_above = violation >= self.recovered.to(violation)
         was_recovering = self.recovering.to(violation.device) & is_above
         costs_anything = violation > -self.limits.to(violation)
@@ -153,7 +153,7 @@ class CRPOStep(TRPOStep):
     Examples:
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss
+        >>> from safe_rl.objectives import CPOLoss, LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
@@ -161,7 +161,7 @@ class CRPOStep(TRPOStep):
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
         >>> loss = CPOLoss(actor, entropy_coeff=0.0)
         >>> step = CRPOStep(loss, tolerance=2.0, target_kl=0.01, damping=0.1, **search)
-        >>> step(batch, cost_violation=torch.tensor([1.0, 5.0]))["reduces"]
+        >>> step(batch, LimitState.of(cost=[26.0, 30.0], limit=[25.0, 25.0]))["reduces"]
         tensor([0., 1.])
     """
 
@@ -170,7 +170,7 @@ class CRPOStep(TRPOStep):
         self.tolerance = tolerance
 
     def _propose(self, problem: StepProblem) -> Proposal:
-        excess = problem.violation - self.tolerance
+        excess = problem.required_decrease - self.tolerance
         worst = int(excess.argmax())
         reduces = torch.zeros_like(excess)
         if excess[worst] > 0:

@@ -14,22 +14,27 @@ from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting
-from safe_rl.objectives import Multiplier
+from safe_rl.objectives import LimitState, Multiplier, SurrogateLoss
 from safe_rl.resumable import Resumable
 
 
 class ConstraintHook(Resumable, TrainerHookBase):
-    """Updates the constraints, and with them the multiplier, with every collected batch.
+    """Updates constraints and multiplier with every collected batch, and tells a loss.
 
     A trainer calls it before the losses (`register`), and logs its returns, costs, violations and
     multipliers.
 
     Args:
-        constraints: The constraints; their multiplier, if any, is the one that the loss reads.
+        constraints: The constraints, without a risk measure.
         accounting: Sums costs and rewards of the collector's batches over episodes.
+        multiplier: The multiplier that the loss reads, or None.
+        loss: Policy loss that the trainer minimises itself, or None.
+
+    Attributes:
+        limits: State of the limits after the last batch, or None.
 
     Raises:
-        TypeError: If the constraints can replace costs by charges, as `TrackedConstraints` can.
+        TypeError: If the constraints have a risk measure.
 
     Examples:
         >>> accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
@@ -37,27 +42,37 @@ class ConstraintHook(Resumable, TrainerHookBase):
         >>> done = torch.tensor([[[False], [True]]])
         >>> step = {"reward": torch.ones(1, 2, 1), "cost": torch.ones(1, 2, 1), "done": done}
         >>> _ = hook(TensorDict({"next": step}, [1, 2]))
-        >>> hook.constraints.violation
+        >>> hook.limits.violation
         tensor([1.])
     """
 
-    state_names = ("accounting", "constraints", "multiplier")
-
-    def __init__(self, constraints: Constraints, accounting: EpisodeAccounting) -> None:
-        if type(constraints).apply_risk is not Constraints.apply_risk:
+    def __init__(
+        self,
+        constraints: Constraints,
+        accounting: EpisodeAccounting,
+        *,
+        multiplier: Multiplier | None = None,
+        loss: SurrogateLoss | None = None,
+    ) -> None:
+        if constraints.risk is not None:
             raise TypeError(
-                f"ConstraintHook takes plain Constraints, not {type(constraints).__name__}: these "
-                "replace costs before advantages are estimated, which TorchRL's trainers do not "
-                "see. Use Constraints(limits), or train.py with risk=…."
+                "ConstraintHook takes no risk measure: it replaces costs before advantages are "
+                "estimated, which TorchRL's trainers do not see. Use train.py with risk=…."
             )
         self.constraints, self.accounting = constraints, accounting
+        self.multiplier, self.loss = multiplier, loss
+        self.limits: LimitState | None = None
         self._row: dict[str, float] = {}
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Update the constraints from a batch [N, T] or [T], which is not changed."""
+        """Update everything from a batch [N, T] or [T], which is not changed."""
         episodes = self.accounting.update(batch)
-        self.constraints.update(episodes, batch)
-        self._row = episodes.scalars() | self.constraints.columns()
+        self.limits = self.constraints.update(batch, episodes)
+        if self.multiplier is not None:
+            self.multiplier.update(self.limits)
+        if self.loss is not None:
+            self.loss.prepare(batch, self.limits)
+        self._row = episodes.scalars() | self.constraints.columns(self.limits, self.multiplier)
         return batch
 
     def log(self, batch: TensorDictBase) -> dict[str, float]:
@@ -65,9 +80,11 @@ class ConstraintHook(Resumable, TrainerHookBase):
         return self._row
 
     @property
-    def multiplier(self) -> Multiplier | None:
-        """The constraints' multiplier, saved with this hook because the constraints do not."""
-        return self.constraints.multiplier
+    def state_names(self) -> tuple[str, ...]:
+        """What a checkpoint has of it."""
+        return (
+            "accounting", "constraints", *(["multiplier"] if self.multiplier is not None else [])
+        )  # fmt: skip
 
     def register(self, trainer: Trainer, name: str = "constraints") -> None:
         """Add the hook to a trainer, for every batch, its log and its checkpoints."""
@@ -85,7 +102,7 @@ class UpdateStepper(Resumable, OptimizationStepper):
     Args:
         policy_update: A `TRPOStep`, a `CPOStep` or a `MinibatchUpdate`.
         critic_update: Update that fits the critics afterwards, or None.
-        constraints: Constraints of a constrained step, updated by a `ConstraintHook`; or None.
+        hook: Updates the constraints of a constrained step, or None.
 
     Examples:
         >>> from safe_rl.algorithms import TRPOStep
@@ -108,10 +125,10 @@ class UpdateStepper(Resumable, OptimizationStepper):
         self,
         policy_update: PolicyUpdate,
         critic_update: MinibatchUpdate | None = None,
-        constraints: Constraints | None = None,
+        hook: ConstraintHook | None = None,
     ) -> None:
         self.policy_update, self.critic_update = policy_update, critic_update
-        self.constraints = Constraints({}) if constraints is None else constraints
+        self.hook = hook
 
     def step(self, trainer: Trainer | None, sub_batch: TensorDictBase) -> TensorDictBase:
         """Improve policy and critics on a batch with advantages and value targets, of any shape.
@@ -119,12 +136,12 @@ class UpdateStepper(Resumable, OptimizationStepper):
         Returns:
             Diagnostics of the updates, as scalars; one per constraint for vectors [k].
         """
-        known = self.constraints
-        rows = [self.policy_update(sub_batch, known.violation, known.episode_length)]
+        constraints = Constraints({}) if self.hook is None else self.hook.constraints
+        rows = [self.policy_update(sub_batch, None if self.hook is None else self.hook.limits)]
         if self.critic_update is not None:
             rows.append({f"critic_{k}": v for k, v in self.critic_update(sub_batch).items()})
         scalars: dict[str, float] = {}
         for row in rows:
             for name, value in row.items():
-                scalars |= known.column(name, torch.as_tensor(value))
+                scalars |= constraints.column(name, torch.as_tensor(value))
         return TensorDict({name: torch.tensor(value) for name, value in scalars.items()})

@@ -19,7 +19,9 @@ from safe_rl.algorithms.losses import sum_of_losses
 from safe_rl.checks import Fraction
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.fisher import FisherProduct
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.samples import learning_samples, require_finite
+from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trust_region import (
     backtracking_search,
     best_in_span,
@@ -30,7 +32,6 @@ from safe_rl.objectives.trust_region import (
     policy_in,
     subsample,
 )
-from safe_rl.objectives.violation import matched_violation
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
@@ -42,14 +43,12 @@ class StepProblem(NamedTuple):
     Attributes:
         losses: Outputs of the loss before the step, with gradients.
         fisher: Product with the Fisher matrix of the policy, plus damping.
-        cost_violation: J_c − d, [k], if the caller knows it.
-        episode_length: T̄, scalar, if the caller knows it.
+        limits: State of the limits, if the caller gives it.
     """
 
     losses: TensorDictBase
     fisher: FisherProduct
-    cost_violation: Tensor | None
-    episode_length: Tensor | None
+    limits: LimitState | None
 
     @property
     def surrogates(self) -> Tensor:
@@ -57,16 +56,23 @@ class StepProblem(NamedTuple):
         return self.losses["cost_surrogate"]
 
     @property
-    def violation(self) -> Tensor:
-        """J_c − d, one per surrogate, [k]."""
-        return matched_violation(self.cost_violation, self.surrogates)
+    def required_decrease(self) -> Tensor:
+        """Decrease of J_c that each surrogate has to predict, [k]: J_c − d without a tracker."""
+        return self._known_limits.required_decrease_for(self.surrogates)
 
     @property
     def length(self) -> Tensor:
-        """T̄, scalar; an error if the caller does not give it."""
-        if self.episode_length is None:
-            raise ValueError("A step with limits on episodes needs the mean episode_length.")
-        return torch.as_tensor(self.episode_length).to(self.surrogates)
+        """T̄, scalar."""
+        return self._known_limits.length.to(self.surrogates)
+
+    @property
+    def _known_limits(self) -> LimitState:
+        if self.limits is None:
+            raise ValueError(
+                "A constrained step needs the state of the limits: pass what "
+                "Constraints.update(batch, episodes) returns, step(batch, limits)."
+            )
+        return self.limits
 
 
 class Proposal(NamedTuple):
@@ -156,18 +162,14 @@ class TRPOStep(PolicyUpdate):
         self.parameters = [p for p in self.actor_network.parameters() if p.requires_grad]
 
     def __call__(
-        self,
-        batch: TensorDictBase,
-        cost_violation: Tensor | None = None,
-        episode_length: Tensor | None = None,
+        self, batch: TensorDictBase, limits: LimitState | None = None
     ) -> dict[str, Tensor]:
         """Take one step.
 
         Args:
             batch: On-policy data with the entries that the loss reads, of any shape; padding is not
                 used.
-            cost_violation: J_c − d, [k]; read by constrained steps only.
-            episode_length: T̄, scalar; read by constrained steps only.
+            limits: State of the limits; constrained steps and losses with costs need it.
 
         Returns:
             The outputs of the loss after the step, ``kl`` (mean KL(π_θ ‖ π_k)), ``step_fraction``
@@ -183,10 +185,12 @@ class TRPOStep(PolicyUpdate):
             require_finite(batch, self.loss.in_keys)
         with torch.no_grad():
             reference = ReferencePolicy(policy_in(self.actor_network, batch))
+        if isinstance(self.loss, SurrogateLoss):
+            self.loss.prepare(batch, limits)
         losses = self.loss(batch)
         sample = subsample(batch, self.fisher_subsample)
         fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
-        problem = StepProblem(losses, fisher, cost_violation, episode_length)
+        problem = StepProblem(losses, fisher, limits)
         proposal = self._propose(problem)
         del fisher, problem
         if not proposal.step.isfinite().all():

@@ -126,7 +126,6 @@ _ROWS: dict[str, tuple[Any, str]] = {
     "evaluation.episodes": (_int(1, 10**6), "episodes of an evaluation"),
     "loss": (_Part, "the policy's loss"),
     "policy_update": (_Part, "the update of the policy"),
-    "then": (dict[str, dict[str, _Part]], "losses and updates after policy_update"),
     "critic_update": (_Part, "the update of the critics"),
 }
 KEYS = {path: Parameter(values_of(kind), meaning) for path, (kind, meaning) in _ROWS.items()} | {

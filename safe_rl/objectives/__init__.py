@@ -10,6 +10,7 @@ from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.deterministic_losses import BCLoss, TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.gae import normalise_advantages
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier, ProjectedMultiplier
 from safe_rl.objectives.penalties import IPOLoss, P3OLoss
@@ -41,6 +42,7 @@ __all__ = [
     "IPOLoss",
     "JointAdvantages",
     "LagrangeMultiplier",
+    "LimitState",
     "LimitTracker",
     "Multiplier",
     "P3OLoss",

@@ -7,11 +7,12 @@ from typing import Annotated, Any
 import torch
 from annotated_types import Interval
 from pydantic import NonNegativeFloat
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.checks import Weight
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.sac import SACLagrangianLoss
-from safe_rl.objectives.violation import KnownCosts
 
 
 def discounted_share(gamma: float, episode_length: Tensor) -> Tensor:
@@ -59,7 +60,7 @@ class CALLoss(SACLagrangianLoss):
         settings: Settings of a `SACLagrangianLoss`.
 
     Attributes:
-        discounted_limit: d', [k]; infinite, so that λ̂ is 0, until `calibrate` sets it.
+        discounted_limit: d', [k]; infinite, so that λ̂ is 0, until `prepare` sets it.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_squashed_actor
@@ -99,28 +100,28 @@ class CALLoss(SACLagrangianLoss):
         self.register_buffer("discounted_limit", torch.full_like(zeros, torch.inf))
         # averages over batches: of predicted costs, and of J_c
         self.register_buffer("known_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
-        # sum and number of the predictions since the last `calibrate`
+        # sum and number of the predictions since the last `prepare`
         self.register_buffer("predicted_costs", torch.zeros(2, *zeros.shape, device=zeros.device))
 
     def cost_weights(self, values: Tensor) -> Tensor:
-        """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `calibrate`."""
+        """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `prepare`."""
         means = values.flatten(0, -2).mean(0).to(self.predicted_costs)
         self.predicted_costs.add_(torch.stack([means, torch.ones_like(means)]))
-        charged = self.charged(values).flatten(0, -2).mean(0)
-        excess = (charged - self.discounted_limit) / self.cost_unit
+        expected = self.cost_of(values).flatten(0, -2).mean(0)
+        excess = (expected - self.discounted_limit) / self.cost_unit
         weight = self.multiplier.value.to(excess) + self.convexity * excess
         return weight.clamp_min(0) / self.cost_unit
 
-    def calibrate(self, episodes: KnownCosts) -> None:
-        """Compute d' from predictions since the last call and a new batch (d = J_c − violation)."""
-        super().calibrate(episodes)
+    def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
+        """Also compute d' from the predictions since the last call, J_c and its target."""
+        super().prepare(batch, limits)
         total, number = self.predicted_costs
-        expected = discounted_share(self.gamma, episodes.episode_length)
+        expected = discounted_share(self.gamma, limits.length)
         if number.any():
-            news = torch.stack([total / number, episodes.costs])
+            news = torch.stack([total / number, limits.cost])
             self.known_costs.lerp_(news, 1 - self.ratio_memory)
             self.predicted_costs.zero_()
         by_critics, by_episodes = self.known_costs
         ratio = torch.where(by_episodes > 0, by_critics / by_episodes, expected)
         ratio = ratio.clamp(expected / self.largest_ratio, expected * self.largest_ratio)
-        self.discounted_limit.copy_(ratio * (episodes.costs - episodes.violation))
+        self.discounted_limit.copy_(ratio * limits.target)

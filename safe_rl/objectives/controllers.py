@@ -11,6 +11,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from safe_rl.checks import Weight
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
 
 
@@ -18,9 +19,9 @@ class PIMultiplier(Multiplier):
     """Multiplier from a proportional-integral (PI) controller of the violation.
 
     λ = clip(K_P Δ + I, 0, highest) and I ← clip(I + K_I Δ, 0, highest), with Δ = (J_c − d) / scale
-    and |Δ| ≤ saturation. The integral stops at the bounds of λ (anti-windup by clamping). Without
-    the bound on Δ, a cost of six times the limit would raise the integral five times as fast as a
-    cost of 0 lowers it.
+    and |Δ| ≤ saturation. The scale is `LimitState.scale`, which is d unless d is near 0. The
+    integral stops at the bounds of λ (anti-windup by clamping). Without the bound on Δ, a cost of
+    six times the limit would raise the integral five times as fast as a cost of 0 lowers it.
 
     `docs/algorithms/holding_the_limit.md` explains how gains set the period and the damping.
 
@@ -37,12 +38,11 @@ class PIMultiplier(Multiplier):
         >>> multiplier = PIMultiplier(
         ...     {"cost": 25.0}, init=0.0, kp=1.0, ki=0.1, saturation=1.0, highest=5.0
         ... )
-        >>> multiplier.update([12.5])  # J_c = 37.5
+        >>> multiplier.update(LimitState.of(cost=[37.5], limit=[25.0]))
         >>> multiplier.value
         tensor([0.5500])
     """
 
-    scale: Tensor
     integral: Tensor
 
     def __init__(
@@ -58,16 +58,11 @@ class PIMultiplier(Multiplier):
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs)
         self.kp, self.ki, self.saturation, self.highest = kp, ki, saturation, highest
-        self.register_buffer("scale", torch.where(self.limits > 0, self.limits, 1.0))
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
 
-    def set_scale(self, scale: Tensor) -> None:
-        """Set the units of violations, [k] > 0; by default the limits, or 1 for a limit of 0."""
-        self.scale.copy_(scale)
-
-    def _step(self, violation: Tensor) -> dict[str, Tensor]:
-        error = violation / self.scale
+    def _step(self, state: LimitState) -> dict[str, Tensor]:
+        error = state.violation / state.scale
         error = error.clamp(-self.saturation, self.saturation)
         integral = (self.integral + self.ki * error).clamp(0, self.highest)
         penalty = (self.kp * error + integral).clamp(0, self.highest)
@@ -100,13 +95,12 @@ class PIDMultiplier(Multiplier):
         >>> gains = {"kp": 0.1, "ki": 0.01, "kd": 0.0, "init": 0.0, "scale": 1.0}
         >>> smoothing = {"proportional_ema": 0.0, "derivative_ema": 0.0, "derivative_delay": 1}
         >>> multiplier = PIDMultiplier({"cost": 25.0}, **gains, **smoothing)
-        >>> multiplier.update([10.0])  # J_c = 35
+        >>> multiplier.update(LimitState.of(cost=[35.0], limit=[25.0]))
         >>> multiplier.value
         tensor([1.1000])
     """
 
     scale: Tensor
-    raised: Tensor
     integral: Tensor
     smoothed_error: Tensor
     smoothed_cost: Tensor
@@ -136,27 +130,18 @@ class PIDMultiplier(Multiplier):
         self.kp, self.ki, self.kd = kp, ki, kd
         self.proportional_ema, self.derivative_ema = proportional_ema, derivative_ema
         self.register_buffer("scale", scales.clone())
-        # target − limit, set before every update: checkpoints need not hold it
-        self.register_buffer("raised", torch.zeros(self.num_costs), persistent=False)
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
         for name in ("smoothed_error", "smoothed_cost"):
             self.register_buffer(name, torch.zeros(self.num_costs))
         self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
 
-    def set_target(self, target: Tensor) -> None:
-        """Set the target that violations are measured from, [k]; by default the limits.
-
-        Without it, the derivative term would take a falling target for a growing cost.
-        """
-        self.raised.copy_(target - self.limits)
-
-    def _step(self, violation: Tensor) -> dict[str, Tensor]:
-        error = violation / self.scale
+    def _step(self, state: LimitState) -> dict[str, Tensor]:
+        error = state.violation / self.scale
         smoothed_error = torch.lerp(error, self.smoothed_error, self.proportional_ema)
         integral = (self.integral + self.ki * error).clamp_min(0)
-        cost = (violation + self.limits + self.raised) / self.scale
-        cost = torch.lerp(cost, self.smoothed_cost, self.derivative_ema)
+        # of the cost, not of the violation: a target that falls is no growth
+        cost = torch.lerp(state.cost / self.scale, self.smoothed_cost, self.derivative_ema)
         growth = (cost - self.past_costs[0]).clamp_min(0)
         penalty = self.kp * smoothed_error + integral + self.kd * growth
         return {

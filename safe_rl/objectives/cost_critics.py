@@ -13,9 +13,9 @@ from torch import Tensor
 from torchrl.objectives.utils import distance_loss
 
 from safe_rl.objectives.critics import critic_bias
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
-from safe_rl.objectives.violation import KnownCosts
 
 _COSTS = "cost_qvalue_network"
 
@@ -48,10 +48,11 @@ class CostCritics(QFunctionLoss):
         settings: Settings of the loss without costs.
 
     Raises:
-        ValueError: If the cost critic is no ensemble, or there is not one multiplier per cost.
+        ValueError: If the cost critic is no ensemble, or there is not one multiplier per cost. By
+            the actor's loss, if `prepare` has not been called: u and r are not known.
 
     Attributes:
-        cost_unit: u, the typical size of one cost (`EpisodeCosts.unit`), [k]; 1 before `calibrate`.
+        cost_unit: u, the typical size of one cost (`LimitState.unit`), [k].
         reward_unit: r, the standard deviation of the rewards of all steps; 1 while they are equal.
     """
 
@@ -63,6 +64,7 @@ class CostCritics(QFunctionLoss):
     cost_unit: Tensor
     reward_unit: Tensor
     reward_sums: Tensor
+    _is_prepared = False
 
     def __init__(
         self,
@@ -115,19 +117,18 @@ class CostCritics(QFunctionLoss):
         ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
         return critic_bias(self.expected(values), costs, *ends, self.gamma)
 
-    def calibrate(self, episodes: KnownCosts) -> None:
-        """Update the size u of one cost; called before the gradient steps of every batch."""
-        self.cost_unit.copy_(episodes.unit)
-
-    def measure(self, rewards: Tensor) -> None:
-        """Update the standard deviation r of rewards with the rewards of new steps, [...]."""
-        rewards = rewards.detach().flatten().to(self.reward_sums)
+    def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
+        """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
+        self.cost_unit.copy_(limits.unit)
+        rewards = batch.get(("next", self.tensor_keys.reward)).detach().flatten()
+        rewards = rewards.to(self.reward_sums)
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))
         number, total, squares = self.reward_sums
         variance = squares / number - (total / number).square()
         varies = variance > 1e-12 * squares / number  # more than by rounding errors
         self.reward_unit.copy_(torch.where(varies, variance.sqrt(), 1.0))
+        self._is_prepared = True
 
     def cost_qvalue_loss(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Loss of the cost critics, summed over networks and costs."""
@@ -138,17 +139,17 @@ class CostCritics(QFunctionLoss):
             ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
-        found = self.q_values(_COSTS, tensordict, tensordict.get(self.tensor_keys.action))
-        loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
+        outputs = self.q_values(_COSTS, tensordict, tensordict.get(self.tensor_keys.action))
+        loss = self.cost_errors(outputs, costs, discount, values).sum(-1).sum(0)
         return self._mean(loss, tensordict)
 
     def cost_errors(
-        self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+        self, outputs: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
         """Distance of the critics from their TD(0) targets, for every step.
 
         Args:
-            found: Outputs of the networks, [E, ..., k].
+            outputs: Outputs of the networks, [E, ..., k].
             costs: Costs of the steps, [..., k].
             discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
             following: Outputs of the target networks in the next state, [E, ..., k].
@@ -157,7 +158,7 @@ class CostCritics(QFunctionLoss):
             The distances, [E, ..., k].
         """
         target = costs + discount * self.bounded(following)
-        return distance_loss(found, target, loss_function=self.loss_function)
+        return distance_loss(outputs, target, loss_function=self.loss_function)
 
     def bounded(self, values: Tensor) -> Tensor:
         """Values to bootstrap on, from outputs [E, ..., k] of the target networks."""
@@ -170,15 +171,20 @@ class CostCritics(QFunctionLoss):
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss [...] with the cost penalty, and diagnostics."""
+        if not self._is_prepared:
+            raise ValueError(
+                f"{type(self).__name__} does not know the scales of costs and rewards: call "
+                "prepare(batch, limits) with every batch, before its updates."
+            )
         values = self.q_values(_COSTS, tensordict, action, "frozen")
-        found = self.of_samples(values.detach(), tensordict)
-        weights = self.cost_weights(found).to(values)
-        charges = self.reward_unit * (self.charged(values) @ weights)
-        objective = (objective + charges) / (1 + weights.sum())
-        reported = {**self.cost_figures(found), "cost_weight": weights}
+        samples = self.of_samples(values.detach(), tensordict)
+        weights = self.cost_weights(samples).to(values)
+        penalty = self.reward_unit * (self.cost_of(values) @ weights)
+        objective = (objective + penalty) / (1 + weights.sum())
+        reported = {**self.cost_figures(samples), "cost_weight": weights}
         return objective, {name: x for name, x in reported.items() if name in self.out_keys}
 
-    def charged(self, values: Tensor) -> Tensor:
+    def cost_of(self, values: Tensor) -> Tensor:
         """Costs of actions as the actor's loss has them, [..., k], from outputs [E, ..., k]."""
         return pessimistic(values, self.pessimism)
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from safe_rl.objectives.risk import Charges
+from safe_rl.objectives.risk import PenalisedCosts
 from safe_rl.resumable import Resumable
 
 #: Number of ends of episodes over which the mean length is computed.
@@ -247,24 +247,24 @@ class EpisodeCosts(Resumable):
         return CostEstimate(self._mean, self._error)
 
     def update(
-        self, costs: Tensor, lengths: Tensor, charges: Charges | None = None
+        self, costs: Tensor, lengths: Tensor, penalised: PenalisedCosts | None = None
     ) -> CostEstimate:
         """Update the estimate with a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: Charges of a risk measure, to estimate instead of costs; `unit` ignores them.
+            penalised: Costs of a risk measure, which are estimated instead; `unit` ignores them.
         """
         costs = costs.to(self._sums)
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
-        charged = costs if charges is None else charges.costs.to(costs)
-        self.noise.update(charged.mean(1).float())
-        mean, error = (part.float() for part in rate_estimate(charged, self.length))
+        limited = costs if penalised is None else penalised.costs.to(costs)
+        self.noise.update(limited.mean(1).float())
+        mean, error = (part.float() for part in rate_estimate(limited, self.length))
         batch = CostEstimate(mean, error * self.noise.variance_factor.sqrt())
-        if charges is not None:
-            batch = batch._replace(mean=batch.mean + charges.offset)
+        if penalised is not None:
+            batch = batch._replace(mean=batch.mean + penalised.offset)
         self.batch = batch
         if self.drift is not None:
             size = self._size(self.estimate.mean)

@@ -8,53 +8,15 @@ are in `docs/algorithms/holding_the_limit.md`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
 from safe_rl.checks import Checked, Fraction, Share, Weight
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
-from safe_rl.objectives.risk import Charges
+from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.risk import PenalisedCosts
 from safe_rl.resumable import Resumable
-
-
-class LimitState(NamedTuple):
-    """The state of k limits that an update needs.
-
-    Attributes:
-        cost: Estimate of J_c, undiscounted cost per episode, [k].
-        target: Current upper bound of J_c, from limit, descent and margin, [k].
-        length: Mean episode length T̄ in steps, scalar.
-        unit: Typical size of one cost, [k]; see `EpisodeCosts.unit`.
-        scale: Unit of violations, [k]: the limit, but at least `smallest_scale` per step.
-        trust: Share of a predicted change of J_c that is observed, [k].
-        integrated: Integral (weighted sum of earlier violations) added to the violation, [k].
-    """
-
-    cost: Tensor
-    target: Tensor
-    length: Tensor
-    unit: Tensor
-    scale: Tensor
-    trust: Tensor
-    integrated: Tensor
-
-    @property
-    def violation(self) -> Tensor:
-        """J_c − target, [k]."""
-        return self.cost - self.target
-
-    @property
-    def demand(self) -> Tensor:
-        """Decrease of J_c that a step's surrogate must predict, [k]; if negative, J_c may rise."""
-        change = self.violation + self.integrated
-        return torch.where(change > 0, change / self.trust, change)
-
-    def to(self, device: torch.device) -> LimitState:
-        """The same on another device."""
-        return LimitState(*(entry.to(device) for entry in self))
 
 
 def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
@@ -167,7 +129,7 @@ class LimitTracker(Checked, Resumable):
     """
 
     state_names = (
-        *("costs", "predictions", "_steps", "_reached", "_noise", "_integrated", "_recovers"),
+        *("costs", "predictions", "_steps", "_reached", "_noise", "_integral", "_recovers"),
     )
 
     def __init__(
@@ -213,7 +175,7 @@ class LimitTracker(Checked, Resumable):
         self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral
         self._steps = 0
-        self._integrated = torch.zeros(num_costs)
+        self._integral = torch.zeros(num_costs)
         self._reached = torch.full((num_costs,), torch.inf)
         self._recovers = torch.zeros(num_costs, dtype=torch.bool)
         self._noise = torch.full((num_costs,), torch.nan)
@@ -233,18 +195,20 @@ class LimitTracker(Checked, Resumable):
         return line
 
     @torch.no_grad()
-    def update(self, costs: Tensor, lengths: Tensor, charges: Charges | None = None) -> LimitState:
+    def update(
+        self, costs: Tensor, lengths: Tensor, penalised: PenalisedCosts | None = None
+    ) -> LimitState:
         """Update estimates and targets with a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            charges: Charges that replace the costs if a risk measure is limited, not their mean.
+            penalised: Costs that a risk measure puts in their place, or None.
         """
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
-        estimate = self.costs.update(costs, lengths, charges)
-        if charges is not None:
-            self.limits = charges.limit
+        estimate = self.costs.update(costs, lengths, penalised)
+        if penalised is not None:
+            self.limits = penalised.limit
         batch = self.costs.batch
         smallest = self.smallest_scale * self.costs.length * self.costs.unit
         scale = torch.maximum(self.limits, smallest)
@@ -254,16 +218,16 @@ class LimitTracker(Checked, Resumable):
         num_steps = costs.shape[0] * costs.shape[1] * self.steps_per_decision
         target = self._target(estimate, scale, num_steps)
         error = (estimate.mean - target).clamp(-scale, scale)
-        integrated = (self._integrated + self.integral * error).clamp_min(0)
-        self._integrated = torch.minimum(integrated, self.largest_integral * scale)
+        integral = (self._integral + self.integral * error).clamp_min(0)
+        self._integral = torch.minimum(integral, self.largest_integral * scale)
         return LimitState(
             cost=estimate.mean,
             target=target,
             length=self.costs.length,
             unit=self.costs.unit,
             scale=scale,
-            trust=self.predictions.share,
-            integrated=self._integrated,
+            realised_share=self.predictions.share,
+            integral=self._integral,
         )
 
     def _target(self, estimate: CostEstimate, scale: Tensor, num_steps: int) -> Tensor:

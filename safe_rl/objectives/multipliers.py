@@ -1,7 +1,7 @@
 """Lagrange multipliers, one λ per cost: dual ascent by Adam or by plain gradient steps.
 
-Once per epoch a multiplier gets the violations J_c − d, where J_c is the mean undiscounted cost of
-an episode. It increases λ if J_c exceeds its limit d, and decreases λ if not. Its whole state is in
+After every batch a multiplier gets the state of the limits. It increases λ if J_c, the mean
+undiscounted cost of an episode, exceeds its target, and decreases λ if not. Its own state is in
 buffers. `safe_rl.objectives.controllers` has multipliers that are PI and PID controllers.
 """
 
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from safe_rl.checks import Checked
+from safe_rl.objectives.limit_state import LimitState
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Interval(gt=0, le=1e6)]
@@ -107,43 +108,32 @@ class Multiplier(Checked, nn.Module, ABC):
         return self.penalty.detach()
 
     @torch.no_grad()
-    def update(self, violation: Tensor | Sequence[float] | float) -> None:
-        """Update λ after an epoch.
+    def update(self, state: LimitState) -> None:
+        """Update λ after a batch.
 
-        If a violation is not finite (NaN: no episode finished in the epoch), the multiplier of this
-        cost and its state do not change.
+        If there is no new estimate of a cost (`is_new` is False, or its violation is NaN), the
+        multiplier of this cost and its state do not change.
 
         Args:
-            violation: J_c − d, [k] (or a scalar if k = 1): mean undiscounted cost of an episode
-                minus its limit or target.
+            state: What `safe_rl.algorithms.Constraints.update` returns; in a loop without it,
+                `LimitState.of`.
 
         Raises:
-            ValueError: If there is not one number per cost.
+            ValueError: If there is not one limit per cost.
         """
-        given = torch.as_tensor(violation, dtype=self.limits.dtype, device=self.limits.device)
-        if given.numel() != self.num_costs:
+        if state.violation.shape != (self.num_costs,):
             raise ValueError(
                 f"update() needs one violation for each of {self.cost_keys}, "
-                f"got shape {tuple(given.shape)}."
+                f"got shape {tuple(state.violation.shape)}."
             )
-        given = given.reshape(self.num_costs)
-        known = given.isfinite()
-        for name, new in self._step(torch.where(known, given, 0.0)).items():
+        known = state.violation.isfinite() & state.is_new
+        for name, new in self._step(state).items():
             buffer = self.get_buffer(name)
             buffer.copy_(torch.where(known, new, buffer))
 
-    def set_scale(self, scale: Tensor) -> None:
-        """Set the units of violations, [k] > 0; most multipliers ignore this."""
-
-    def set_unit(self, unit: Tensor) -> None:
-        """Set the typical size u of one cost, [k] > 0; some multipliers divide violations by it."""
-
-    def set_target(self, target: Tensor) -> None:
-        """Set the target that violations are measured from, [k]; most multipliers ignore this."""
-
     @abstractmethod
-    def _step(self, violation: Tensor) -> dict[str, Tensor]:
-        """Return the new value of every state buffer ([..., k]) given finite J_c − d, [k]."""
+    def _step(self, state: LimitState) -> dict[str, Tensor]:
+        """Return the new value of every state buffer, [..., k]."""
 
 
 class LagrangeMultiplier(Multiplier):
@@ -161,7 +151,7 @@ class LagrangeMultiplier(Multiplier):
 
     Examples:
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
-        >>> multiplier.update(torch.tensor([35.0]))  # J_c = 60
+        >>> multiplier.update(LimitState.of(cost=[60.0], limit=[25.0]))
         >>> multiplier.value
         tensor([1.0319])
     """
@@ -187,9 +177,9 @@ class LagrangeMultiplier(Multiplier):
         """The multipliers λ = softplus(ν) > 0, [k], detached."""
         return softplus(self.nu).detach()
 
-    def _step(self, violation: Tensor) -> dict[str, Tensor]:
+    def _step(self, state: LimitState) -> dict[str, Tensor]:
         beta1, beta2 = 0.9, 0.999
-        grad = -violation
+        grad = -state.violation
         step = self.step + 1
         exp_avg = torch.lerp(grad, self.exp_avg, beta1)
         exp_avg_sq = torch.lerp(grad.square(), self.exp_avg_sq, beta2)
@@ -203,7 +193,7 @@ class ProjectedMultiplier(Multiplier):
 
     FOCOPS (Zhang, Vuong and Ross 2020) and CUP (Yang et al. 2022) use it; with a small α and
     without λ_max, so does RCPO (Tessler et al. 2019, algorithm 1). u is the typical size of one
-    cost: 1, as in the articles, unless cost advantages have been divided by it (`set_unit`).
+    cost, by which losses divide λ; it is 1 for costs of 0 or 1, and in the articles.
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
@@ -213,15 +203,13 @@ class ProjectedMultiplier(Multiplier):
 
     Examples:
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.01, highest=2.0)
-        >>> multiplier.update([35.0])  # J_c = 60
+        >>> multiplier.update(LimitState.of(cost=[60.0], limit=[25.0]))
         >>> multiplier.value
         tensor([0.3500])
-        >>> multiplier.update([975.0])
+        >>> multiplier.update(LimitState.of(cost=[1000.0], limit=[25.0]))
         >>> multiplier.value
         tensor([2.])
     """
-
-    unit: Tensor
 
     def __init__(
         self,
@@ -234,13 +222,7 @@ class ProjectedMultiplier(Multiplier):
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest
         self.register_buffer("penalty", per_cost("init", init, self.num_costs))
-        # set before every update: checkpoints need not hold it
-        self.register_buffer("unit", torch.ones_like(self.limits), persistent=False)
 
-    def set_unit(self, unit: Tensor) -> None:
-        """Set u, [k] > 0."""
-        self.unit.copy_(unit)
-
-    def _step(self, violation: Tensor) -> dict[str, Tensor]:
-        moved = self.penalty + self.lr * violation / self.unit
+    def _step(self, state: LimitState) -> dict[str, Tensor]:
+        moved = self.penalty + self.lr * state.violation / state.unit
         return {"penalty": moved.clamp(0, self.highest)}

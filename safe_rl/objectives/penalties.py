@@ -11,34 +11,26 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.policy_losses import PPOLoss, clipped_gain
-from safe_rl.objectives.violation import Violations, constraint_value, violation_of
 
 
 class PenaltyLoss(PPOLoss):
     """PPO with a penalty on the predicted costs, for k constraints.
 
-    Args:
-        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
-        constraints: Object from which J_c − d and T̄ are read at every call.
-        settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
+    `prepare` has to be called with every batch: the penalties need J_c − d and T̄. Costs are
+    averaged over the samples for any ``reduction``. Arguments are those of `PPOLoss`.
     """
 
     has_costs = True
 
-    def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        constraints: Violations,
-        **settings: Any,
-    ) -> None:
-        super().__init__(actor_network, **settings)
-        self.constraints = constraints
-
-    def _excess(self, surrogates: Tensor) -> Tensor:
-        """(J_c − d) / T̄ plus the surrogates: predicted violations per step, [k]."""
-        violation = violation_of(self.constraints, surrogates)
-        return surrogates + constraint_value(violation, self.constraints.episode_length, True)
+    def _state(self) -> LimitState:
+        if self.limits is None:
+            raise ValueError(
+                f"{type(self).__name__} has no state of the limits yet: call "
+                "prepare(batch, limits) with every batch, before its first step."
+            )
+        return self.limits
 
 
 class P3OLoss(PenaltyLoss):
@@ -56,34 +48,36 @@ class P3OLoss(PenaltyLoss):
     Adds ``loss_penalty`` and the detached ``cost_surrogate`` [k], E[max(ρA_c, clip(ρ)A_c)].
 
     Args:
-        parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
+        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
         kappa: Penalty factor κ, for every cost, in units of the standardised reward advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from safe_rl.algorithms import Constraints
         >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-        >>> constraints = Constraints({"cost": 25.0})
-        >>> constraints.violation.fill_(10.0)  # in a run they observe their episodes
-        tensor([10.])
-        >>> constraints.episode_length.fill_(100.0)
-        tensor(100.)
-        >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
-        >>> loss = P3OLoss(actor, constraints, kappa=20.0, **settings)
+        >>> loss = P3OLoss(actor, kappa=20.0, clip_epsilon=0.2, entropy_coeff=0.0)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.zeros(8, 1)
-        >>> round(loss(batch)["loss_penalty"].item(), 3)  # 20 · 10 / 100
+        >>> state = LimitState.of(cost=[35.0], limit=[25.0], length=100.0)
+        >>> losses = loss(loss.prepare(batch, state))
+        >>> round(losses["loss_penalty"].item(), 3)  # 20 · 10 / 100
         2.0
     """
 
     extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate")
 
-    def __init__(self, *parts: Any, kappa: NonNegativeFloat, **settings: Any) -> None:
-        super().__init__(*parts, **settings)
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        kappa: NonNegativeFloat,
+        **settings: Any,
+    ) -> None:
+        super().__init__(actor_network, **settings)
         self.kappa = kappa
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
@@ -93,7 +87,7 @@ class P3OLoss(PenaltyLoss):
         surrogates = self._cost_surrogates(tensordict, gain)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_penalty": self.kappa * self._excess(surrogates).relu().sum(),
+            "loss_penalty": self.kappa * self._state().excess(surrogates).relu().sum(),
             "cost_surrogate": surrogates.detach(),
         }
 
@@ -129,19 +123,17 @@ class IPOLoss(PenaltyLoss):
     Adds ``loss_barrier`` and the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
-        parts: Actor, and constraints, whose J_c − d and T̄ are read at every call.
+        actor_network: Policy with `get_dist`; see `SurrogateLoss`.
         kappa: Strength κ = 1/t of the barrier, in units of the cost of an episode.
         max_weight: Largest weight of a cost, which it has at the limit and beyond, in units of the
             standardised reward advantage.
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
-        >>> from safe_rl.algorithms import Constraints
         >>> from safe_rl.models import make_actor
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
-        >>> constraints = Constraints({"cost": 25.0})
-        >>> loss = IPOLoss(actor, constraints, kappa=0.01, max_weight=10.0, **settings)
+        >>> loss = IPOLoss(actor, kappa=0.01, max_weight=10.0, **settings)
         >>> "loss_barrier" in loss.out_keys
         True
     """
@@ -150,21 +142,24 @@ class IPOLoss(PenaltyLoss):
 
     def __init__(
         self,
-        *parts: Any,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
         kappa: Annotated[float, Interval(ge=1e-9, le=1e9)],
         max_weight: Annotated[float, Interval(ge=1e-9, le=1e9)],
         **settings: Any,
     ) -> None:
-        super().__init__(*parts, **settings)
+        super().__init__(actor_network, **settings)
         self.kappa, self.max_weight = kappa, max_weight
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)
         # before the first batch T̄ is not known
-        kappa = (self.kappa / self.constraints.episode_length).nan_to_num(self.kappa)
+        kappa = (self.kappa / self._state().length.to(surrogates)).nan_to_num(self.kappa)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_barrier": log_barrier(-self._excess(surrogates), kappa, self.max_weight).sum(),
+            "loss_barrier": log_barrier(
+                -self._state().excess(surrogates), kappa, self.max_weight
+            ).sum(),
             "cost_surrogate": surrogates.detach(),
         }

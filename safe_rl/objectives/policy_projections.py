@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from safe_rl.checks import Share, Weight
 from safe_rl.objectives.distributions import has_closed_kl
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.samples import inputs_of
 from safe_rl.objectives.surrogate import WeighsCosts
 
@@ -102,14 +103,15 @@ class CUPLoss(WeighsCosts):
     Examples:
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import ProjectedMultiplier
+        >>> from safe_rl.objectives import LimitState, ProjectedMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0)
         >>> loss = CUPLoss(actor, multiplier, gamma=0.99, lmbda=0.97, entropy_coeff=0.0)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.ones(8, 1)
-        >>> losses = loss(loss.anchor(batch))  # of a policy that has not moved
+        >>> state = LimitState.of(cost=[25.0], limit=[25.0])
+        >>> losses = loss(loss.prepare(batch, state))  # of a policy that has not moved
         >>> round(losses["loss_objective"].item(), 4)  # 0.5 h / (1 + 0.5 h)
         0.665
     """
@@ -126,15 +128,16 @@ class CUPLoss(WeighsCosts):
         return {key: (ANCHOR, str(name)) for name, key in self._parameter_keys.items()}
 
     @torch.no_grad()
-    def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def prepare(self, batch: TensorDictBase, limits: LimitState | None = None) -> TensorDictBase:
         """Write the current policy's parameters into a batch, as π½, and return the batch."""
-        observed = inputs_of(self.actor_network, tensordict)
+        super().prepare(batch, limits)
+        observed = inputs_of(self.actor_network, batch)
         actor, weights = self.actor_network, self.actor_network_params
         with weights.to_module(actor, preserve_module_state=False), set_recurrent_mode(True):
             parameters = actor.get_dist_params(observed)
         for name, key in self._parameter_keys.items():
-            tensordict[ANCHOR, str(name)] = parameters.get(key).clone()
-        return tensordict
+            batch[ANCHOR, str(name)] = parameters.get(key).clone()
+        return batch
 
     def _kl(
         self, tensordict: TensorDictBase, distribution: Distribution, log_weight: Tensor

@@ -14,9 +14,9 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 from safe_rl.checks import Checked
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.samples import require, sample_mask
 from safe_rl.objectives.shared_tensors import SharesTensors
-from safe_rl.objectives.violation import KnownCosts
 
 
 @runtime_checkable
@@ -78,11 +78,13 @@ class ReplayLoss(Checked, SharesTensors):
         """Losses of the Q functions alone, for gradient steps that do not change the policy."""
         raise NotImplementedError
 
-    def calibrate(self, episodes: KnownCosts) -> None:
-        """Update estimates of episode costs; called before the gradient steps of every batch."""
+    def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
+        """Learn the scales of costs and rewards: call it with every batch, before its updates.
 
-    def measure(self, rewards: Tensor) -> None:
-        """Update the scale of rewards with the rewards of new steps, [...]."""
+        Args:
+            batch: New steps of the current policy, [N, T].
+            limits: State after this batch, as `safe_rl.algorithms.Constraints.update` returns it.
+        """
 
     def cost_bias(self, batch: TensorDictBase) -> Tensor | None:
         """Bias of the critics of k costs on new steps [N, T], [k]; None without such critics."""

@@ -1,13 +1,14 @@
 """Limits on other measures than the mean: CVaR, and the share of episodes above a limit.
 
 With a limit d on the mean cost, a third to a half of the episodes cost more than d. A risk measure
-replaces the costs of steps by other numbers, *charges*. The mean over episodes of the sum of
-charges is the measure, up to an offset that does not depend on the policy to first order. So
-everything that keeps a limit on a mean (critics, advantages, multipliers, steps, the descent of the
-limit) also keeps a limit on the measure.
+replaces the costs of steps by *penalised costs*. The mean over episodes of their sum is the
+measure, up to an offset that does not depend on the policy to first order. So everything that keeps
+a limit on a mean (critics, advantages, multipliers, steps, the descent of the limit) also keeps a
+limit on the measure.
 
-A step has a charge if the cost of its episode up to this step passes a threshold. So the measure
-needs the cost of unfinished episodes at the start of a batch, but no batches of whole episodes.
+A step has a penalised cost if the cost of its episode up to this step passes a threshold. So the
+measure needs the cost of unfinished episodes at the start of a batch, but no batches of whole
+episodes.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from safe_rl.checks import Checked, Fraction, Weight
 from safe_rl.resumable import Resumable
 
 
-class Charges(NamedTuple):
+class PenalisedCosts(NamedTuple):
     """The values that replace the costs of a batch.
 
     Attributes:
-        costs: Charges of the batch's steps, [N, T, k].
-        offset: Constant that is added to the sum of an episode's charges, [k].
+        costs: Those of the batch's steps, [N, T, k].
+        offset: Constant that is added to their sum over an episode, [k].
         limit: Limit of the mean of this total over episodes, [k].
     """
 
@@ -41,7 +42,7 @@ class Charges(NamedTuple):
 class RiskMeasure(Checked, Resumable, ABC):
     """A measure of episode costs that is limited instead of their mean.
 
-    If the charges depend on earlier batches, ``state_names`` names the attributes to save.
+    If they depend on earlier batches, ``state_names`` names the attributes to save.
 
     Attributes:
         limits: Limits d, [k].
@@ -50,13 +51,15 @@ class RiskMeasure(Checked, Resumable, ABC):
     limits: Tensor
 
     @property
-    def held_limits(self) -> Tensor:
-        """Limit of the mean charges of an episode, [k]."""
+    def measured_limits(self) -> Tensor:
+        """Limit of the mean penalised cost of an episode, [k]."""
         return self.limits
 
     @abstractmethod
-    def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
-        """Compute the charges of a batch.
+    def __call__(
+        self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
+    ) -> PenalisedCosts:
+        """Compute the penalised costs of a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k], none negative.
@@ -98,8 +101,8 @@ class CVaR(RiskMeasure):
     With the cost C of an episode, CVaR = ν + E[(C − ν)₊] / α. ν is the value at risk: a fraction α
     of the episodes costs more (Rockafellar and Uryasev 2000, theorem 1). ν minimises the
     expression, so its change with the policy has an effect of second order only, and (C − ν)₊ / α
-    has the gradient of the CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The charge of a step
-    is the increase of (C − ν)₊ / α by this step.
+    has the gradient of the CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The penalised cost
+    of a step is the increase of (C − ν)₊ / α by this step.
 
     The measure is (1 − κ) E[C] + κ CVaR, where κ rises from 0 to 1: at first, it is the mean. A
     limit on the CVaR must be higher than one on the mean: on PointGoal1 a policy with a mean of 25
@@ -117,8 +120,8 @@ class CVaR(RiskMeasure):
         >>> risk = CVaR(torch.tensor([50.0]), tail=0.5, window=100, ramp_start=0, ramp_steps=0)
         >>> costs, ends = torch.ones(2, 3, 1), torch.tensor([[False, False, True]] * 2)
         >>> finished = torch.tensor([[3.0], [13.0]])
-        >>> charges = risk(costs, ends, torch.tensor([[0.0], [10.0]]), finished)
-        >>> charges.costs.sum((1, 2)), charges.offset  # ν = 3
+        >>> penalised = risk(costs, ends, torch.tensor([[0.0], [10.0]]), finished)
+        >>> penalised.costs.sum((1, 2)), penalised.offset  # ν = 3
         (tensor([0., 6.]), tensor([3.]))
     """
 
@@ -148,25 +151,27 @@ class CVaR(RiskMeasure):
             return 0.0
         return min(1.0, max(0.0, (self._steps - self.ramp_start) / max(1, self.ramp_steps)))
 
-    def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
-        """Charge the steps of a batch: see `RiskMeasure`."""
+    def __call__(
+        self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
+    ) -> PenalisedCosts:
+        """Compute the penalised costs of a batch: see `RiskMeasure`."""
         self._finished = torch.cat([self._finished, finished.float()])[-self.window :]
         self._steps += ends.numel() * self._steps_per_decision
         weight = self.weight
         if not weight:
-            return Charges(costs, torch.zeros_like(self.limits), self.limits)
+            return PenalisedCosts(costs, torch.zeros_like(self.limits), self.limits)
         threshold = value_at_risk(self._finished, self.tail)
         beyond = (cost_so_far(costs, ends, before) - threshold).clamp_min(0)
         tail = torch.minimum(costs, beyond) / self.tail
-        return Charges((1 - weight) * costs + weight * tail, weight * threshold, self.limits)
+        return PenalisedCosts((1 - weight) * costs + weight * tail, weight * threshold, self.limits)
 
 
 class Chance(RiskMeasure):
     """P(C > d) ≤ ε: at most a fraction ε of the episodes costs more than d.
 
-    The step at which an episode's cost passes d has the charge w = max(d, 1), all other steps 0. So
-    the sum of an episode's charges is w 1{C > d}, and the limit of its mean is w ε. With the weight
-    w, λ has about the same size as for a limit on the mean cost.
+    The step at which an episode's cost passes d has the penalised cost w = max(d, 1), all others 0.
+    Their sum over an episode is w 1{C > d}, and the limit of its mean is w ε. With the weight w, λ
+    has about the same size as for a limit on the mean cost.
 
     Args:
         cost_limits: Limits d, [k].
@@ -185,14 +190,16 @@ class Chance(RiskMeasure):
         self.most_over = most_over
 
     @property
-    def held_limits(self) -> Tensor:
-        """Limit of the mean charges of an episode, w ε, [k]."""
+    def measured_limits(self) -> Tensor:
+        """Limit of the mean penalised cost of an episode, w ε, [k]."""
         return self.weight * self.most_over
 
-    def __call__(self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor) -> Charges:
-        """Charge the steps of a batch: see `RiskMeasure`."""
+    def __call__(
+        self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
+    ) -> PenalisedCosts:
+        """Compute the penalised costs of a batch: see `RiskMeasure`."""
         over = cost_so_far(costs, ends, before) > self.limits
         was_over = (over & ~ends.unsqueeze(-1)).roll(1, 1)
         was_over[:, 0] = before > self.limits
-        charged = torch.where(over & ~was_over, self.weight, 0.0).to(costs)
-        return Charges(charged, torch.zeros_like(self.limits), self.held_limits)
+        crossing = torch.where(over & ~was_over, self.weight, 0.0).to(costs)
+        return PenalisedCosts(crossing, torch.zeros_like(self.limits), self.measured_limits)

@@ -20,6 +20,7 @@ from safe_rl.objectives.distributions import (
     kl,
     sampler_of,
 )
+from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import inputs_of, require, sample_mask
 from safe_rl.objectives.shared_tensors import SharesTensors
@@ -94,6 +95,8 @@ class SurrogateLoss(Checked, SharesTensors):
     target_actor_network_params: TensorDictParams
     entropy_coeff: Tensor
 
+    limits: LimitState | None = None
+
     #: Entries besides ``loss_objective`` that a subclass adds.
     extra_out_keys: tuple[str, ...] = ()
 
@@ -121,12 +124,29 @@ class SurrogateLoss(Checked, SharesTensors):
         """Whether cost advantages are read."""
         return self.multiplier is not None
 
-    def anchor(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Prepare a batch before the first step of an update, and return it.
+    def prepare(self, batch: TensorDictBase, limits: LimitState | None = None) -> TensorDictBase:
+        """Prepare for the gradient steps on a batch, and return the batch.
 
-        A loss that is measured relative to the present policy stores that policy's parameters.
+        Call it with every batch, before the first step; a `safe_rl.algorithms.MinibatchUpdate` does
+        so. A loss with costs keeps the state of the limits. A loss that is measured relative to the
+        present policy writes this policy's parameters into the batch.
+
+        Args:
+            batch: Batch of any shape.
+            limits: State after this batch; a loss without costs needs none.
+
+        Raises:
+            ValueError: If the loss has costs and gets no state.
         """
-        return tensordict
+        if not self.has_costs:
+            return batch
+        if limits is None:
+            raise ValueError(
+                f"{type(self).__name__} needs the state of the limits: pass what "
+                "Constraints.update(batch, episodes) returns, update(batch, limits)."
+            )
+        self.limits = limits
+        return batch
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
@@ -261,7 +281,9 @@ class SurrogateLoss(Checked, SharesTensors):
 
 
 class WeighsCosts(SurrogateLoss):
-    """Mixin for a policy loss without costs: adds costs, weighted by a multiplier.
+    """Mixin for a policy loss without costs: adds costs, weighted by λ / u.
+
+    u is the typical size of one cost (`LimitState.unit`), 1 before `prepare`.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
@@ -287,6 +309,11 @@ class WeighsCosts(SurrogateLoss):
                 f"{multiplier!r}: without constraints use PPOLoss or TRPOLoss."
             )
         self.multiplier = multiplier
+
+    def _cost_advantage(self, tensordict: TensorDictBase) -> Tensor:
+        """Cost advantages in units of one cost, A_c / u, [..., k]."""
+        advantage = super()._cost_advantage(tensordict)
+        return advantage if self.limits is None else advantage / self.limits.unit.to(advantage)
 
     def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""

@@ -69,7 +69,7 @@ class WCSACLoss(SACLagrangianLoss):
         ...     actor, q, cost_q, multiplier=multiplier, cost_keys=["cost"], **settings
         ... )
         >>> mean, variance = torch.tensor([[3.0]]), torch.tensor([[3.0]])
-        >>> loss.charged(torch.stack([mean, variance]))  # 3 + 0.7979 √softplus(3)
+        >>> loss.cost_of(torch.stack([mean, variance]))  # 3 + 0.7979 √softplus(3)
         tensor([[4.3931]])
     """
 
@@ -95,10 +95,10 @@ class WCSACLoss(SACLagrangianLoss):
         """Mean of the cost-return of actions, [..., k]."""
         return self.moments(values)[0].mean(0)
 
-    def charged(self, values: Tensor) -> Tensor:
+    def cost_of(self, values: Tensor) -> Tensor:
         """CVaR_α of the cost-return of actions, [..., k]."""
         mean, variance = self.moments(values)
-        return super().charged(mean + self._factor * variance.sqrt())
+        return super().cost_of(mean + self._factor * variance.sqrt())
 
     def moment_targets(
         self, mean: Tensor, costs: Tensor, discount: Tensor, following: tuple[Tensor, Tensor]
@@ -113,10 +113,10 @@ class WCSACLoss(SACLagrangianLoss):
         return target, (second_moment - mean.square()).clamp_min(_SMALLEST)
 
     def cost_errors(
-        self, found: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+        self, outputs: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
         """Squared 2-Wasserstein distance of pairs of critics from their targets, [E/2, ..., k]."""
-        mean, variance = self.moments(found)
+        mean, variance = self.moments(outputs)
         later_mean, later_variance = self.moments(following)
         later = self.bounded(later_mean), later_variance
         target, spread = self.moment_targets(mean.detach(), costs, discount, later)

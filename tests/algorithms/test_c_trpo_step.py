@@ -6,7 +6,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from run_configs import point_mass_config
-from samples import DELTA, TRUST_REGION, make_actor, make_batch, whole_step
+from samples import DELTA, TRUST_REGION, limit_state, make_actor, make_batch, whole_step
 
 from safe_rl.algorithms import CTRPOStep, OnPolicy
 from safe_rl.algorithms.recovery_steps import barrier_divergence
@@ -71,7 +71,7 @@ def test_the_step_is_the_natural_one_of_the_divergence():
     g = flatten(torch.autograd.grad(objective, parameters, retain_graph=True)).double()
     h_g = torch.linalg.solve(matrix, g)
     expected = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
-    taken, _ = whole_step(step, batch, violation, LENGTH)
+    taken, _ = whole_step(step, batch, limit_state(*violation.tolist()))
     torch.testing.assert_close(
         taken.double(), expected, atol=5e-3 * expected.abs().max().item(), rtol=2e-2
     )
@@ -82,7 +82,7 @@ def test_a_step_stays_in_its_region_and_within_the_limits(violation):
     actor, batch = make_case(1)
     step = c_trpo(actor, 1)
     before = step.loss(batch)
-    metrics = step(batch, torch.tensor([violation]), LENGTH)
+    metrics = step(batch, limit_state(violation))
     after = step.loss(batch)
     change = LENGTH * (after["cost_surrogate"] - before["cost_surrogate"]).detach()
     barrier = barrier_divergence(change, torch.tensor([-violation])).sum()
@@ -104,7 +104,7 @@ def test_recoveries_begin_at_a_limit_and_end_below_it():
     seen = []
     for violation in (-1.0, 0.5, -1.0, -4.9, -5.1, -1.0, torch.nan):
         before = step.loss(batch)["cost_surrogate"]
-        recovers = bool(step(batch, torch.tensor([violation]), LENGTH)["recovers"])
+        recovers = bool(step(batch, limit_state(violation))["recovers"])
         seen.append(recovers)
         assert not recovers or step.loss(batch)["cost_surrogate"] < before
         twin = c_trpo(actor, 1)
@@ -119,7 +119,7 @@ def test_of_several_costs_the_worst_is_recovered_within_the_limits_of_the_others
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([1.0, 1.0, -1.0])
     step = c_trpo(actor, 3)
     before = step.loss(batch)["cost_surrogate"].detach()
-    metrics = step(batch, torch.tensor([3.0, 9.0, -0.2]), LENGTH)
+    metrics = step(batch, limit_state(3.0, 9.0, -0.2))
     change = LENGTH * (step.loss(batch)["cost_surrogate"].detach() - before)
     assert metrics["recovers"].tolist() == [1.0, 1.0, 0.0]
     assert change[1] < 0
@@ -132,7 +132,7 @@ def test_a_cost_within_its_limit_comes_last_however_large_its_hysteresis():
     step = c_trpo(actor, limits=[5.0, 500.0])
     for other in (-20.0, 0.5, -20.0):  # at last it still recovers, and is no longer violated
         before = step.loss(batch)["cost_surrogate"].detach()
-        metrics = step(batch, torch.tensor([1.0, other]), LENGTH)
+        metrics = step(batch, limit_state(1.0, other))
         assert metrics["recovers"][0]
         assert step.loss(batch)["cost_surrogate"][0] < before[0]
     assert metrics["recovers"][1]
@@ -145,7 +145,7 @@ def test_at_a_limit_of_nothing_a_policy_without_costs_learns_from_its_rewards():
     recovers = []
     for violation in (2.0, 0.0, 0.0):
         before = step.loss(batch)["loss_objective"]
-        metrics = step(batch, torch.tensor([violation, -10.0]), LENGTH)
+        metrics = step(batch, limit_state(violation, -10.0))
         recovers.append(metrics["recovers"].tolist())
     assert recovers == [[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
     assert step.loss(batch)["loss_objective"] < before
@@ -158,15 +158,9 @@ def test_ten_times_the_cost_of_an_episode_is_ten_times_the_barrier():
     changed = []
     for times in (1.0, 10.0):
         actor.load_state_dict(state)
-        c_trpo(actor, 1, beta=BETA / times)(batch, torch.tensor([-times]), times * LENGTH)
+        c_trpo(actor, 1, beta=BETA / times)(batch, limit_state(-times, length=100.0 * times))
         changed.append(flatten(actor.parameters()).detach())
     torch.testing.assert_close(*changed)
-
-
-def test_the_length_of_an_episode_is_needed():
-    actor, batch = make_case(1)
-    with pytest.raises(ValueError, match="needs the mean episode_length"):
-        c_trpo(actor, 1)(batch, torch.tensor([-1.0]))
 
 
 def test_the_limit_of_a_share_of_episodes_is_what_recoveries_go_by():

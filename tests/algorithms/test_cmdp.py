@@ -7,13 +7,14 @@ import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
 from tabular import ONE_OF_THREE, TWO_COMPONENTS
 
-from safe_rl.algorithms import Constraints, CPOStep, CRPOStep, CTRPOStep, PCPOStep, TRPOStep
+from safe_rl.algorithms import CPOStep, CRPOStep, CTRPOStep, PCPOStep, TRPOStep
 from safe_rl.objectives import (
     CPOLoss,
     CUPLoss,
     FOCOPSLoss,
     IPOLoss,
     LagrangeMultiplier,
+    LimitState,
     P3OLoss,
     PIDMultiplier,
     PPOLagrangianLoss,
@@ -38,7 +39,8 @@ def ppo_update(loss, actor):
     """Adam passes over the batch until the policy has moved far enough."""
     adam = torch.optim.Adam(actor.parameters(), lr=0.01)
 
-    def update(batch):
+    def update(batch, state=None):
+        loss.prepare(batch, state)
         for _ in range(10):
             losses = loss(batch)
             if losses["kl"] > 1.2 * TARGET_KL:
@@ -50,10 +52,15 @@ def ppo_update(loss, actor):
     return update
 
 
+def state_of(cmdp, mean_costs):
+    return LimitState.of(cost=mean_costs, limit=cmdp.limits, length=STEPS)
+
+
 def multiplier_first(multiplier, update):
     def update_both(batch, mean_costs):
-        multiplier.update(mean_costs - multiplier.limits)
-        update(batch)
+        state = LimitState.of(cost=mean_costs, limit=multiplier.limits)
+        multiplier.update(state)
+        update(batch, state)
 
     return update_both
 
@@ -111,28 +118,18 @@ def trpo_pid(actor, cmdp):
 
 def cpo(actor, cmdp):
     step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **TRUST_REGION)
-    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
-
-
-def observed_first(constraints, cmdp, update):
-    def observe_and_update(batch, mean_costs):
-        constraints.violation.copy_(mean_costs - cmdp.limits)
-        constraints.episode_length.fill_(STEPS)
-        update(batch)
-
-    return observe_and_update
+    return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 
 def p3o(actor, cmdp):
-    constraints = Constraints(cmdp.cost_limits)
-    loss = P3OLoss(actor, constraints, kappa=20.0, **PPO)
-    return observed_first(constraints, cmdp, ppo_update(loss, actor))
+    update = ppo_update(P3OLoss(actor, kappa=20.0, **PPO), actor)
+    return lambda batch, mean_costs: update(batch, state_of(cmdp, mean_costs))
 
 
 def ipo(actor, cmdp):
-    constraints = Constraints(cmdp.cost_limits)
-    loss = IPOLoss(actor, constraints, kappa=0.01 * STEPS, max_weight=10.0, **PPO)
-    return observed_first(constraints, cmdp, ppo_update(loss, actor))
+    loss = IPOLoss(actor, kappa=0.01 * STEPS, max_weight=10.0, **PPO)
+    update = ppo_update(loss, actor)
+    return lambda batch, mean_costs: update(batch, state_of(cmdp, mean_costs))
 
 
 def projected_multiplier(cmdp):
@@ -151,14 +148,14 @@ def weighed(kind, **settings):
 
 def crpo(actor, cmdp):
     step = CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=0.0, **TRUST_REGION)
-    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+    return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 
 def pcpo(actor, cmdp):
     step = PCPOStep(
         CPOLoss(actor, entropy_coeff=0.0), projection="kl", rescale_violation=True, **TRUST_REGION
     )
-    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+    return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 
 def c_trpo(actor, cmdp):
@@ -166,7 +163,7 @@ def c_trpo(actor, cmdp):
     loss = CPOLoss(actor, entropy_coeff=0.0)
     region = {**TRUST_REGION, "target_kl": 0.01}  # the size of a recovery is one step
     step = CTRPOStep(loss, cmdp.cost_limits, **barrier, **region)
-    return lambda batch, mean_costs: step(batch, mean_costs - cmdp.limits, torch.tensor(STEPS))
+    return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 
 def cup(actor, cmdp):
@@ -174,9 +171,9 @@ def cup(actor, cmdp):
     loss = CUPLoss(actor, multiplier, gamma=0.9, lmbda=0.3, entropy_coeff=0.0)
     improve, project = ppo_update(PPOLoss(actor, **PPO), actor), ppo_update(loss, actor)
 
-    def update(batch):
+    def update(batch, state):
         improve(batch)
-        project(loss.anchor(batch))
+        project(batch, state)
 
     return dual_ascent(multiplier, update)
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from point_mass_runs import point_mass_trainer
 from run_configs import CONF
+from samples import limit_state
 from tensordict import TensorDict
 
 from safe_rl import trust
@@ -21,28 +22,27 @@ allow("custom_loss")
 
 def test_the_penalty_of_a_policy_that_has_not_moved():
     actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-    constraints = Constraints({"cost_hazards": 10.0, "cost_vases_contact": 5.0})
     loss = custom_loss.QuadraticPenaltyLoss(
-        actor, constraints, strength=100.0, clip_epsilon=0.2, entropy_coeff=0.0
+        actor, strength=100.0, clip_epsilon=0.2, entropy_coeff=0.0
     )
     with torch.no_grad():
         batch = actor(TensorDict(observation=torch.randn(50, 3), batch_size=[50]))
     batch["advantage"], batch["cost_advantage"] = torch.randn(50, 1), torch.zeros(50, 2)
-    assert loss(batch)["loss_penalty"] == 0  # no episode has ended, as in a loop of one's own
-    constraints.violation.copy_(torch.tensor([20.0, -3.0]))
-    constraints.episode_length.fill_(100.0)
-    torch.testing.assert_close(loss(batch)["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))
+    nothing_known = limit_state(torch.nan, torch.nan, length=torch.nan)
+    assert loss(loss.prepare(batch, nothing_known))["loss_penalty"] == 0
+    losses = loss(loss.prepare(batch, limit_state(20.0, -3.0, length=100.0)))
+    torch.testing.assert_close(losses["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))
 
 
-def test_charges_sum_to_mean_and_semideviation():
+def test_penalised_costs_sum_to_mean_and_semideviation():
     costs = torch.rand(6, 10, 1)
     ends = torch.zeros(6, 10, dtype=torch.bool)
     ends[:, -1] = True
     totals = costs.sum(1)
     risk = custom_loss.UpperSemideviation(torch.tensor([1.0]), weight=0.5, memory=0.0)
-    charged = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
+    penalised = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
     expected = totals.mean() + 0.5 * (totals - totals.mean()).clamp_min(0).mean()
-    torch.testing.assert_close(charged.mean(), expected)
+    torch.testing.assert_close(penalised.mean(), expected)
 
 
 @pytest.mark.parametrize("algo", ["quadratic", "cpo"])

@@ -1,17 +1,14 @@
 """Parts put together by hand, with entries below another one, learn what they do without."""
 
-from dataclasses import dataclass
 from functools import partial
 
 import pytest
 import torch
-from point_mass import PointMass
-from run_configs import point_mass_config
 from samples import make_actor, make_critic
-from tensordict import NestedKey, TensorDict
+from tensordict import TensorDict
 
 from safe_rl.algorithms import MinibatchUpdate, OnPolicy
-from safe_rl.algorithms.constraints import Constraints, TrackedConstraints
+from safe_rl.algorithms.constraints import Constraints
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import (
     CostGAE,
@@ -21,7 +18,6 @@ from safe_rl.objectives import (
     PPOLagrangianLoss,
     VectorGAE,
 )
-from safe_rl.trust import allow
 
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
 TRACKER = {
@@ -60,7 +56,8 @@ def make_algorithm(below, constraints_of):
     constraints = constraints_of(at)
     advantage = VectorGAE(critic, **SETTINGS)
     cost_advantage = CostGAE([at("cost")], cost_critic, **SETTINGS)
-    loss = PPOLagrangianLoss(actor, constraints.multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+    multiplier = LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1)
+    loss = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
     critic_loss = CriticLoss(critic, cost_critic)
     for part, given in (
         (advantage, "advantage"), (cost_advantage, "cost_advantage"), (loss, "loss"),
@@ -72,7 +69,7 @@ def make_algorithm(below, constraints_of):
         minibatch_size=None,
     )  # fmt: skip
     return OnPolicy(
-        actor, critic, cost_critic, constraints, advantage, cost_advantage,
+        actor, critic, cost_critic, constraints, multiplier, advantage, cost_advantage,
         update(loss), update(critic_loss),
     )  # fmt: skip
 
@@ -94,18 +91,11 @@ def make_batch(algorithm, below):
 
 
 def plain(at):
-    multiplier = LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1)
-    return Constraints({at("cost"): 1.0}, multiplier=multiplier)
+    return Constraints({at("cost"): 1.0})
 
 
 def tracked(at):
-    constraints = TrackedConstraints(
-        {at("cost"): 1.0},
-        tracker=LimitTracker(torch.tensor([1.0]), **TRACKER),
-        multiplier=LagrangeMultiplier({at("cost"): 1.0}, init=1.0, lr=0.1),
-    )
-    constraints.cost_advantage = at("cost_advantage")
-    return constraints
+    return Constraints({at("cost"): 1.0}, tracker=LimitTracker(torch.tensor([1.0]), **TRACKER))
 
 
 @pytest.mark.parametrize("constraints_of", [plain, tracked])
@@ -123,25 +113,3 @@ def test_entries_below_another_one_are_learned_from_as_at_the_root(constraints_o
     assert rows[0] == rows[1]
     assert torch.equal(*learned)
     assert torch.equal(*advantages)
-
-
-class CostsElsewhere(CostGAE):
-    """Writes its advantages to where its own loss looks for them."""
-
-    @dataclass
-    class _AcceptedKeys:
-        advantage: NestedKey = ("costs", "advantage")
-        value_target: NestedKey = "cost_value_target"
-        value: NestedKey = "cost_value"
-        reward: NestedKey | list[NestedKey] = "cost"
-        done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
-
-    default_keys = _AcceptedKeys
-
-
-def test_a_recipe_weighs_cost_advantages_where_its_estimator_writes_them():
-    allow(__name__)
-    config = point_mass_config(f"cost_advantage._target_={__name__}.CostsElsewhere")
-    algorithm = OnPolicy.from_config(config, PointMass(4))
-    assert algorithm.constraints.cost_advantage == ("costs", "advantage")

@@ -8,6 +8,7 @@ from samples import (
     TRUST_REGION,
     dense_fisher,
     flat_gradients,
+    limit_state,
     make_actor,
     make_batch,
     whole_step,
@@ -19,7 +20,6 @@ from safe_rl.algorithms.cpo_step import nearest_feasible
 from safe_rl.objectives import CPOLoss
 
 SETTINGS = TRUST_REGION
-LENGTH = torch.tensor(100.0)
 
 
 def make_case():
@@ -66,7 +66,7 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
     )
     losses = step.loss(batch)
     g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
-    taken, _ = whole_step(step, batch, torch.tensor([violation]), LENGTH)
+    taken, _ = whole_step(step, batch, limit_state(violation))
     h_g = torch.linalg.solve(matrix, g)
     first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
     back = torch.linalg.solve(matrix, b) if projection == "kl" else b
@@ -84,7 +84,7 @@ def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violat
     loss = CPOLoss(actor, entropy_coeff=0.0)
     step = PCPOStep(loss, projection=projection, rescale_violation=True, **SETTINGS)
     before = loss(batch)
-    metrics = step(batch, torch.tensor([violation, -1e4]), LENGTH)
+    metrics = step(batch, limit_state(violation, -1e4))
     after = loss(batch)
     assert metrics["step_fraction"] > 0
     assert after["kl"] <= DELTA * 1.001
@@ -102,7 +102,7 @@ def test_crpo_switches_at_the_limit_and_its_tolerance(violation, reduces):
     actor, batch = make_case()
     step = CRPOStep(CPOLoss(actor, entropy_coeff=0.0), tolerance=2.0, **SETTINGS)
     before = step.loss(batch)
-    metrics = step(batch, torch.tensor(violation), LENGTH)
+    metrics = step(batch, limit_state(*violation))
     after = step.loss(batch)
     assert metrics["step_fraction"] > 0
     assert 0.3 * DELTA < after["kl"] <= DELTA * 1.001

@@ -1,16 +1,50 @@
-"""The script with TorchRL's own collector and buffer runs, with multipliers that episodes move."""
+"""The script with TorchRL's own collector and buffer, beside the same run by the package."""
 
 import math
 
-import pytest
 import replay_buffer
+from run_configs import compose_config
+
+from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.collectors import EpisodeAccounting
+from safe_rl.envs import SafetyGymEnv
+
+SIZES = ["--num-envs=4", "--frames=12000", "--frames-per-batch=4000", "--updates-per-batch=20"]
+# numbers of the script, and no gradient steps
+SAME = (
+    "env=PointGoal1", "algo=sac_lagrangian", "limits/replay@limits=paper", "lagrangian=replay",
+    "lagrangian.init=0", "lagrangian.kp=0.1", "lagrangian.ki=0.05", "lagrangian.saturation=0.5",
+    "lagrangian.highest=5", "cost_limits={cost: 1}", "policy_update.updates_per_step=1e-9",
+)  # fmt: skip
 
 
-def test_the_losses_fit_torchrls_collector_and_buffer(capsys):
-    sizes = ["--num-envs=4", "--frames=12000", "--frames-per-batch=4000", "--updates-per-batch=20"]
-    rows = replay_buffer.main(["--limit=0", *sizes])
-    assert len(rows) == 3
+def test_lambda_has_the_scale_that_it_has_in_the_package(monkeypatch, capsys):
+    """The same batches give the same λ, and the same weight of a cost beside a reward."""
+    algorithm = find_algorithm(config := compose_config(*SAME)).from_config(
+        config, SafetyGymEnv("PointGoal1", num_envs=4)
+    )
+    expected, losses = [], []
+
+    class Both(EpisodeAccounting):
+        def update(self, batch):
+            episodes = super().update(batch)
+            row = algorithm.learn(batch.clone(), episodes)
+            expected.append((row["multiplier_cost"], algorithm.policy_update.loss))
+            return episodes
+
+    def make_loss(*arguments):
+        losses.extend(made := build(*arguments))
+        return made
+
+    build = replay_buffer.make_loss
+    monkeypatch.setattr(replay_buffer, "EpisodeAccounting", Both)
+    monkeypatch.setattr(replay_buffer, "make_loss", make_loss)
+    rows = replay_buffer.main(["--limit=1", *SIZES])
     assert [row["episodes"] for row in rows] == [4, 4, 4]
-    assert rows[0]["multiplier"] == pytest.approx(0.15 * min(rows[0]["episode_cost"], 0.5))
+    assert [row["multiplier"] for row in rows] == [value for value, _ in expected]
+    assert rows[-1]["multiplier"] > 0
+    ours, theirs = losses[0], expected[-1][1]
+    assert ours.reward_unit == theirs.reward_unit != 1
+    assert ours.cost_unit == theirs.cost_unit
     assert all(math.isfinite(row["loss_qvalue"]) for row in rows)
     assert capsys.readouterr().out.count("J_r") == 3

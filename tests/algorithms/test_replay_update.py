@@ -135,7 +135,7 @@ def test_constructors_are_checked_unless_an_annotation_cannot_be_read():
         def __init__(self, loss: "OnlyForTypeCheckers", *, size: int):  # noqa: F821
             self.size = size
 
-        def __call__(self, batch, cost_violation, episode_length):
+        def __call__(self, batch, limits):
             return {}
 
     assert Own(None, size=3).size == 3

@@ -10,7 +10,7 @@ from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
 from torch import nn
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from safe_rl.algorithms.constraints import CHARGES
+from safe_rl.algorithms.constraints import PENALISED_COSTS
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
 from safe_rl.objectives.risk import cost_so_far
@@ -51,14 +51,14 @@ def totals_of(costs, ends):
 def test_charges_of_cvar_solve_the_program_of_rockafellar_and_uryasev(tail):
     costs, ends = random_episodes()
     finished = totals_of(costs, ends)
-    charges = cvar_of([50.0, 50.0], tail)(costs, ends, torch.zeros(4, 2), finished)
+    penalised = cvar_of([50.0, 50.0], tail)(costs, ends, torch.zeros(4, 2), finished)
     for i in range(2):
         worst = minimize_scalar(
             lambda nu, i=i: nu + (finished[:, i] - nu).clamp_min(0).mean().item() / tail,
             bounds=(0.0, float(finished[:, i].max()) + 1), method="bounded",
             options={"xatol": 1e-6},
         )  # fmt: skip
-        measure = charges.offset[i] + charges.costs[..., i].sum() / len(finished)
+        measure = penalised.offset[i] + penalised.costs[..., i].sum() / len(finished)
         assert measure.item() == pytest.approx(worst.fun, rel=1e-4)
 
 
@@ -89,14 +89,14 @@ def test_batches_that_cut_episodes_charge_the_same(kind):
 def test_chance_charges_one_step_of_every_episode_over_the_limit():
     costs, ends = random_episodes()
     limits = torch.tensor([4.0, 0.0])
-    charges = Chance(limits, most_over=0.2)(costs, ends, torch.zeros(4, 2), torch.empty(0, 2))
+    penalised = Chance(limits, most_over=0.2)(costs, ends, torch.zeros(4, 2), torch.empty(0, 2))
     weight = limits.clamp_min(1)
     for row, first, last in episodes_of(costs, ends):
         spent = costs[row, first : last + 1].sum(0)
-        charged = charges.costs[row, first : last + 1]
-        torch.testing.assert_close(charged.sum(0), torch.where(spent > limits, weight, 0.0))
-        assert ((charged > 0).sum(0) <= 1).all()
-    torch.testing.assert_close(charges.limit, 0.2 * weight)
+        of_episode = penalised.costs[row, first : last + 1]
+        torch.testing.assert_close(of_episode.sum(0), torch.where(spent > limits, weight, 0.0))
+        assert ((of_episode > 0).sum(0) <= 1).all()
+    torch.testing.assert_close(penalised.limit, 0.2 * weight)
 
 
 def test_the_tail_is_ramped_in():
@@ -104,9 +104,9 @@ def test_the_tail_is_ramped_in():
     costs, ends = torch.ones(1, 4, 1), torch.tensor([[False, False, False, True]])
     weights = []
     for _ in range(6):
-        charges = risk(costs, ends, torch.zeros(1, 1), torch.tensor([[4.0]]))
+        penalised = risk(costs, ends, torch.zeros(1, 1), torch.tensor([[4.0]]))
         weights.append(risk.weight)
-        measure = charges.costs.sum() + charges.offset
+        measure = penalised.costs.sum() + penalised.offset
         assert measure.item() == pytest.approx(4.0)  # the worst of equal episodes is the mean one
     assert weights == [0, 0, 0.5, 1, 1, 1]
 
@@ -114,8 +114,8 @@ def test_the_tail_is_ramped_in():
 def test_the_value_at_risk_is_that_of_the_last_episodes():
     risk, ends = cvar_of([5.0], tail=0.5, window=2), torch.zeros(1, 4, dtype=torch.bool)
     for finished in ([[9.0], [9.0]], [[1.0], [2.0]]):
-        charges = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.tensor(finished))
-    assert charges.offset == 1
+        penalised = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.tensor(finished))
+    assert penalised.offset == 1
 
 
 def test_the_accounting_knows_what_open_episodes_have_cost():
@@ -175,16 +175,16 @@ def slopes_of(risk, actor, data):
     """Gradient of the measure by the parameters, as an update sees it."""
     costs, ends = data["next", "cost"], data["next", "done"].squeeze(-1)
     finished = costs.sum(1)
-    charges = risk(costs, ends, torch.zeros(EPISODES, 1), finished)
-    data["next", CHARGES] = charges.costs
-    estimator = CostGAE([CHARGES], None, gamma=1.0, lmbda=1.0, value_target="lambda_return")
+    penalised = risk(costs, ends, torch.zeros(EPISODES, 1), finished)
+    data["next", PENALISED_COSTS] = penalised.costs
+    estimator = CostGAE([PENALISED_COSTS], None, gamma=1.0, lmbda=1.0, value_target="lambda_return")
     estimator(data)
     # a baseline that depends on time
     data["advantage"] = data["cost_advantage"] - data["cost_advantage"].mean(0)
     loss = TRPOLoss(actor, entropy_coeff=0.0)
     by_step = torch.autograd.grad(loss(data)["loss_objective"], list(actor.parameters()))
     gradient = dict(zip(("weight", "bias", "log_std"), by_step, strict=True))
-    measure = charges.offset + charges.costs.sum() / EPISODES
+    measure = penalised.offset + penalised.costs.sum() / EPISODES
     return measure.item(), {name: -STEPS * value.item() for name, value in gradient.items()}
 
 
@@ -227,7 +227,7 @@ def test_every_algorithm_takes_it(tmp_path, algo, risk):
     size = 40 if algo in ("ppo_lagrangian", "p3o") else None
     extra = ["risk.ramp_start=0", "risk.ramp_steps=0", "risk.tail=0.25"] if risk == "cvar" else []
     trainer, table = train(tmp_path, f"algo={algo}", f"risk={risk}", *extra, minibatch_size=size)
-    assert trainer.algorithm.cost_advantage.reward_keys == [CHARGES]
+    assert trainer.algorithm.cost_advantage.reward_keys == [PENALISED_COSTS]
     for key, limit in (("cost_hazards", 2), ("cost_north", 1)):
         held = limit if risk == "cvar" else 0.1 * limit
         expected = [estimate - held for estimate in table[f"estimate_{key}"]]

@@ -10,7 +10,6 @@ from samples import make_actor, make_batch, make_critic, perturb
 from tensordict import TensorDict
 
 from safe_rl.algorithms import Constraints
-from safe_rl.algorithms.constraints import TrackedConstraints
 from safe_rl.algorithms.torchrl_trainers import ConstraintHook
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import (
@@ -20,6 +19,7 @@ from safe_rl.objectives import (
     CVaR,
     JointAdvantages,
     LagrangeMultiplier,
+    LimitState,
     PPOLagrangianLoss,
     VectorGAE,
 )
@@ -44,7 +44,8 @@ def test_ppo_lagrangian_in_torchrls_ppo_trainer():
     assert history["optim_steps"][-1] >= 60
     twin = LagrangeMultiplier(LIMITS, init=1.0, lr=0.05)
     for index in range(3):
-        twin.update([history[f"episode_{key}"][index] - LIMITS[key] for key in LIMITS])
+        costs = [history[f"episode_{key}"][index] for key in LIMITS]
+        twin.update(LimitState.of(cost=costs, limit=list(LIMITS.values())))
         for key, value in zip(LIMITS, twin.value.tolist(), strict=True):
             assert history[f"multiplier_{key}"][index] == pytest.approx(value, rel=1e-5)
             violation = history[f"episode_{key}"][index] - LIMITS[key]
@@ -128,7 +129,7 @@ def test_the_hook_continues_from_its_state():
     def make():
         multiplier = LagrangeMultiplier({"cost": 1.0}, init=1.0, lr=0.1)
         accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
-        return ConstraintHook(Constraints({"cost": 1.0}, multiplier=multiplier), accounting)
+        return ConstraintHook(Constraints({"cost": 1.0}), accounting, multiplier=multiplier)
 
     whole, first, second = make(), make(), make()
     batches = [costly_batch(1.0), costly_batch(2.0, done=False), costly_batch(0.5)]
@@ -142,11 +143,11 @@ def test_the_hook_continues_from_its_state():
     assert rows[2]["violation_cost"] == 0.5 * 8 - 1
 
 
-def test_constraints_that_charge_steps_are_refused():
+def test_a_risk_measure_is_refused():
     accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
     risk = CVaR(torch.tensor([1.0]), tail=0.1, window=20, ramp_start=0, ramp_steps=0)
-    constraints = TrackedConstraints({"cost": 1.0}, tracker=Mock(), risk=risk)
-    with pytest.raises(TypeError, match=r"plain Constraints, not TrackedConstraints.*risk="):
+    constraints = Constraints({"cost": 1.0}, tracker=Mock(), risk=risk)
+    with pytest.raises(TypeError, match=r"takes no risk measure.*risk="):
         ConstraintHook(constraints, accounting)
 
 

@@ -9,6 +9,7 @@ from samples import (
     TRUST_REGION,
     dense_fisher,
     flat_gradients,
+    limit_state,
     make_actor,
     make_batch,
     perturb,
@@ -120,7 +121,7 @@ def test_rejected_step_leaves_the_policy_exactly_as_it_was(kind):
         return TensorDict(loss_objective=value - value.detach() + moved, cost_surrogate=costs)
 
     step = kind(worse_everywhere, actor_network=actor, **SETTINGS)
-    metrics = step(batch, torch.tensor([-5.0]), LENGTH)
+    metrics = step(batch, limit_state(-5.0))
     assert metrics["step_fraction"] == 0
     assert metrics["backtracks"] == 10
     assert metrics["kl"] == 0
@@ -146,7 +147,7 @@ def test_a_surrogate_of_ones_own():
 def test_cpo_cases_move_the_cost_as_they_should(violation, case):
     actor, batch = make_case(1)
     _, _, before = kl_and_surrogates(actor, batch)
-    metrics = cpo_step(actor)(batch, torch.tensor([violation]), LENGTH)
+    metrics = cpo_step(actor)(batch, limit_state(violation))
     kl, reward, after = kl_and_surrogates(actor, batch)
     assert metrics["case"] == case
     assert metrics["step_fraction"] > 0
@@ -165,7 +166,7 @@ def test_cpo_diagnostics_are_the_definitions():
     g, *rows = flat_gradients(actor, losses["loss_objective"], *losses["cost_surrogate"])
     b = torch.stack(rows)
     violation = torch.tensor([-5.0, 3.0])
-    metrics = cpo_step(actor)(batch, violation, LENGTH)
+    metrics = cpo_step(actor)(batch, limit_state(*violation.tolist()))
     q, r = g @ torch.linalg.solve(matrix, g), b @ torch.linalg.solve(matrix, g)
     s = (b * torch.linalg.solve(matrix, b.T).T).sum(-1)
     c = violation.double() / 100
@@ -193,7 +194,7 @@ def test_unconverged_cpo_steps_meet_the_linear_constraints_and_the_radius(violat
     solution = torch.linalg.solve(matrix, g)
     residual = matrix @ conjugate_gradient(fisher, g.float(), 3)[0].double() - g
     assert residual.norm() > 0.02 * g.norm()
-    x, metrics = whole_step(step, batch, violations, LENGTH)
+    x, metrics = whole_step(step, batch, limit_state(*violations.tolist()))
     x = x.double()
     assert metrics["case"] in (1, 2)
     # the radius is spent, and no constraint exceeded, both to rounding
@@ -214,7 +215,7 @@ def test_a_bounded_demand_leaves_the_rest_of_the_step_to_the_reward():
 
     def taken(violation, **settings):
         step = cpo_step(actor, cg_iterations=60, **settings)
-        found, metrics = whole_step(step, batch, torch.tensor([violation]), LENGTH)
+        found, metrics = whole_step(step, batch, limit_state(violation))
         return found.double(), metrics
 
     step, found = taken(1e4, largest_demand=0.8)
@@ -237,12 +238,12 @@ def test_cpo_without_cost_gradient_is_trpo():
     batch["cost_advantage"].zero_()
     twin = make_actor()
     twin.load_state_dict(actor.state_dict())
-    metrics = cpo_step(actor)(batch, torch.tensor([-25.0]), LENGTH)
+    metrics = cpo_step(actor)(batch, limit_state(-25.0))
     TRPOStep(TRPOLoss(twin, entropy_coeff=0.0), **SETTINGS)(batch)
     assert metrics["case"] == 4
     torch.testing.assert_close(flatten(actor.parameters()), flatten(twin.parameters()))
     before = flatten(actor.parameters()).detach().clone()
-    metrics = cpo_step(actor)(batch, torch.tensor([25.0]), LENGTH)
+    metrics = cpo_step(actor)(batch, limit_state(25.0))
     assert metrics["case"] == 0
     assert torch.equal(flatten(actor.parameters()), before)
     assert all(torch.as_tensor(value).isfinite().all() for value in metrics.values())
@@ -252,7 +253,7 @@ def test_subsampled_fisher_steps_stay_in_the_trust_region():
     actor, batch = make_case(1, (100, 40))
     step = cpo_step(actor, fisher_subsample=0.1)
     _, reward, before = kl_and_surrogates(actor, batch)
-    metrics = step(batch, torch.tensor([-2.0]), LENGTH)
+    metrics = step(batch, limit_state(-2.0))
     kl, better, after = kl_and_surrogates(actor, batch)
     assert metrics["step_fraction"] > 0
     assert 0.3 * DELTA < kl <= DELTA * 1.001
@@ -263,10 +264,10 @@ def test_subsampled_fisher_steps_stay_in_the_trust_region():
 def test_errors_say_what_to_change():
     actor, batch = make_case(1)
     step = cpo_step(actor)
-    with pytest.raises(ValueError, match="needs cost_violation"):
+    with pytest.raises(ValueError, match="needs the state of the limits"):
         step(batch)
-    with pytest.raises(ValueError, match="one per cost surrogate"):
-        step(batch, torch.zeros(2), LENGTH)
+    with pytest.raises(ValueError, match="one column per limit"):
+        step(batch, limit_state(0.0, 0.0))
 
 
 @pytest.mark.parametrize("entry", ["advantage", "cost_advantage", "observation", "action"])
@@ -277,6 +278,6 @@ def test_numbers_that_are_none_change_nothing(entry):
     for step in (cpo_step(actor), TRPOStep(CPOLoss(actor, entropy_coeff=0.0), **SETTINGS)):
         read = entry in step.loss.in_keys
         with pytest.raises(FloatingPointError, match=f"'{entry}' is not finite in 1 of 400"):
-            step(batch, torch.zeros(1), LENGTH)
+            step(batch, limit_state(0.0))
         assert read
         assert torch.equal(flatten(actor.parameters()), before)

@@ -62,7 +62,7 @@ def test_every_combination_resolves_and_builds(env, algo, preset):
         return
     algorithm = find_algorithm(config).from_config(config, PointMass(2))
     assert ("cost_critic" in algorithm.networks) == bool(algorithm.cost_keys)
-    assert (algorithm.constraints.multiplier is not None) == (algo in LAGRANGIAN)
+    assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
 
 
 @pytest.mark.parametrize("algo", LAGRANGIAN)
@@ -169,10 +169,8 @@ C_TRPO = {
 }
 # of the methods' own articles, within the setting that all share
 PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
-CUP_UPDATE = PPO["policy_update"] | {"max_kl": 0.02}
-CUP_LOSS = {"_target_": "safe_rl.objectives.CUPLoss", "gamma": 0.99, "lmbda": 0.97}
-PROJECTION = {
-    "loss": {**CUP_LOSS, "entropy_coeff": 0.0}, "policy_update": {**CUP_UPDATE, "adapt_rate": None}
+CUP_UPDATE = PPO["policy_update"] | {
+    "_target_": "safe_rl.algorithms.CUPUpdate", "max_kl": 0.02, "gamma": 0.99, "lmbda": 0.97
 }  # fmt: skip
 PAPER = {
     "ppo": SHARED | PPO,
@@ -187,7 +185,7 @@ PAPER = {
     "rcpo": SHARED | PPO | COSTS | {"lagrangian": {**PROJECTED, "lr": 0.001, "highest": None}},
     "crpo": SHARED | CRPO | COSTS,
     "pcpo": SHARED | PCPO | COSTS,
-    "cup": SHARED | {"policy_update": CUP_UPDATE, "then": {"projection": PROJECTION}} | COSTS
+    "cup": SHARED | {"policy_update": CUP_UPDATE} | COSTS
     | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
     "c_trpo": SHARED | C_TRPO | COSTS,
 }  # fmt: skip

@@ -1,6 +1,6 @@
 """CAL against the augmented Lagrangian's own gradient, and its limit in the critics' terms."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import CALLoss, LagrangeMultiplier
+from safe_rl.objectives import CALLoss, LagrangeMultiplier, LimitState
 from safe_rl.objectives.cal import discounted_share
 
 COSTS = ["cost", "cost_other"]
@@ -28,9 +28,10 @@ def make_loss(kind=CALLoss, init=(2.0, 0.5), **keys):
     )
 
 
-def known(costs, violation, length=1000.0, unit=(1.0, 1.0)):
-    names = {"costs": costs, "violation": violation, "episode_length": length, "unit": unit}
-    return SimpleNamespace(**{name: torch.tensor(value) for name, value in names.items()})
+def prepare(loss, costs, limits=(25.0, 10.0), unit=(1.0, 1.0)):
+    state = LimitState.of(cost=costs, limit=limits, length=1000.0)
+    rewards = TensorDict({"next": {"reward": torch.zeros(2, 3, 1)}}, [2, 3])
+    loss.prepare(rewards, replace(state, unit=torch.tensor(unit)))
 
 
 def test_the_conversion_is_the_discounted_sum_of_even_costs():
@@ -46,7 +47,7 @@ def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
     """By finite differences of E[α log π − Q_r] + Σ max(0, λ + c (E[Q] − d') / u)² / 2c."""
     loss, states = make_loss(pessimism=0.5).double(), torch.randn(6, 3).double()
     steps, unit = TensorDict(observation=states, batch_size=[6]), torch.tensor([1.0, 0.5]).double()
-    loss.cost_unit.copy_(unit)
+    prepare(loss, [0.0, 0.0], unit=(1.0, 0.5))
 
     def objective_and_costs():
         torch.manual_seed(1)
@@ -91,14 +92,14 @@ def test_costs_are_free_until_the_limit_is_known():
 def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
     """Critics 30 % below even spreading: half of their value is the limit if J_c is twice it."""
     loss = make_loss(gamma=0.99, init=(1.0, 1.0))
-    loss.calibrate(known([50.0, 8.0], [25.0, -2.0], unit=(1.0, 2.0)))
+    prepare(loss, [50.0, 8.0], unit=(1.0, 2.0))
     # nothing is known of the critics: the article's conversion
     torch.testing.assert_close(loss.discounted_limit, torch.tensor([2.5, 1.0]), rtol=1e-3, atol=0)
     assert loss.cost_unit.tolist() == [1.0, 2.0]
     for _ in range(3):
         for _ in range(4):
             loss.cost_weights(torch.tensor([3.5, 0.56]).expand(4, 6, 2))
-        loss.calibrate(known([50.0, 8.0], [25.0, -2.0]))
+        prepare(loss, [50.0, 8.0])
     torch.testing.assert_close(loss.discounted_limit, torch.tensor([1.75, 0.7]))
     weights = loss.cost_weights(torch.tensor([1.8, 0.65]).expand(4, 6, 2))
     torch.testing.assert_close(weights, torch.tensor([1.5, 0.5]))
@@ -110,7 +111,7 @@ def test_the_limit_follows_what_batches_say_and_not_too_far():
     said = spent = 0.0
     for costs, values in rows:
         loss.cost_weights(torch.tensor(values).expand(4, 6, 2))
-        loss.calibrate(known(costs, [costs[0] - 25.0, -10.0]))
+        prepare(loss, costs)
         said, spent = 0.75 * said + 0.25 * values[0], 0.75 * spent + 0.25 * costs[0]
         ratio = min(max(said / spent, 0.05), 0.2)  # one below, one within, one above
         assert loss.discounted_limit[0].item() == pytest.approx(25 * ratio, rel=1e-3)
@@ -119,5 +120,5 @@ def test_the_limit_follows_what_batches_say_and_not_too_far():
     other = make_loss(gamma=0.99)
     other.load_state_dict(loss.state_dict())
     for each in (loss, other):
-        each.calibrate(known([10.0, 1.0], [0.0, 0.0]))
+        prepare(each, [10.0, 1.0])
     assert torch.equal(loss.discounted_limit, other.discounted_limit)

@@ -5,11 +5,16 @@ import math
 import pytest
 import torch
 from one_state import best_on_a_grid, minimise, one_state
-from samples import assert_gradients_are_differences, make_actor, make_batch, perturb
+from samples import (
+    assert_gradients_are_differences,
+    limit_state,
+    make_actor,
+    make_batch,
+    perturb,
+)
 from scipy.optimize import linprog
 from tensordict import TensorDict
 
-from safe_rl.algorithms import Constraints
 from safe_rl.objectives import (
     CostGAE,
     CPOLoss,
@@ -29,11 +34,10 @@ CLIP = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
 FREE = {"clip_epsilon": 1.0, "entropy_coeff": 0.0}
 
 
-def held(*violation, episode_length=100.0):
-    constraints = Constraints({f"cost_{i}": 25.0 for i in range(len(violation))})
-    constraints.violation.copy_(torch.tensor(violation))
-    constraints.episode_length.fill_(episode_length)
-    return constraints
+def told(loss, *violation, length=100.0):
+    """The loss, which knows the state of the limits."""
+    loss.prepare(TensorDict(), limit_state(*violation, length=length))
+    return loss
 
 
 def projected(*values):
@@ -42,8 +46,8 @@ def projected(*values):
 
 
 LOSSES = {
-    "p3o": lambda actor: P3OLoss(actor, held(60.0, -90.0), kappa=3.0, **CLIP),
-    "ipo": lambda actor: IPOLoss(actor, held(-200.0, 30.0), kappa=10.0, max_weight=2.0, **CLIP),
+    "p3o": lambda actor: told(P3OLoss(actor, kappa=3.0, **CLIP), 60.0, -90.0),
+    "ipo": lambda actor: told(IPOLoss(actor, kappa=10.0, max_weight=2.0, **CLIP), -200.0, 30.0),
     "divergence": lambda actor: FOCOPSLoss(
         actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
     ),
@@ -101,8 +105,7 @@ def best_within(bound):
 def test_p3o_has_the_optimum_of_the_constrained_problem(length, violation):
     # of an undiscounted limit: ten times the steps, at the same costs per step, change nothing
     actor, logits, batch = one_state(GAIN, COST)
-    constraints = held(violation, episode_length=length)
-    loss = P3OLoss(actor, constraints, kappa=20.0, **FREE)
+    loss = told(P3OLoss(actor, kappa=20.0, **FREE), violation, length=length)
     loss.clip_epsilon.fill_(1e6)
     expected, _ = best_within(-violation / length)
     found = best_on_a_grid(loss, logits, batch)
@@ -117,7 +120,7 @@ def test_p3o_clips_costs_to_their_pessimistic_side():
     expected = 0.0
     for r, cost in zip(ratio.tolist(), COST, strict=True):
         expected += max(r * cost, min(max(r, 0.8), 1.2) * cost) / 3
-    losses = P3OLoss(actor, held(2.5), kappa=20.0, **CLIP)(batch)
+    losses = told(P3OLoss(actor, kappa=20.0, **CLIP), 2.5)(batch)
     assert losses["cost_surrogate"].item() == pytest.approx(expected, abs=1e-6)
     assert losses["loss_penalty"].item() == pytest.approx(20 * max(expected + 0.025, 0), abs=1e-5)
 
@@ -127,7 +130,7 @@ def test_ipo_stays_inside_by_no_more_than_the_gap_of_a_barrier(kappa):
     """Of one barrier of strength κ, in the units of the objective, the value is at most κ below
     the optimum; the loss takes it in those of an episode of 100 steps."""
     actor, logits, batch = one_state(GAIN, COST)
-    loss = IPOLoss(actor, held(-20.0), kappa=100 * kappa, max_weight=1e3, **FREE)
+    loss = told(IPOLoss(actor, kappa=100 * kappa, max_weight=1e3, **FREE), -20.0)
     loss.clip_epsilon.fill_(1e6)
     _, optimum = best_within(0.2)
     found = best_on_a_grid(loss, logits, batch)
@@ -200,28 +203,30 @@ def test_rcpo_is_ppo_on_the_penalised_reward():
 
 def test_projected_multipliers_move_by_the_violation_and_stop_at_their_bounds():
     multiplier = ProjectedMultiplier([25.0, 5.0], init=[0.0, 1.9], lr=0.01, highest=2.0)
-    multiplier.update([-5.0, 5.0])
+    multiplier.update(limit_state(-5.0, 5.0))
     assert multiplier.value.tolist() == pytest.approx([0.0, 1.95])
-    multiplier.update([35.0, 55.0])
+    multiplier.update(limit_state(35.0, 55.0))
     assert multiplier.value.tolist() == pytest.approx([0.35, 2.0])
-    multiplier.update([torch.nan, -5.0])
+    multiplier.update(limit_state(torch.nan, -5.0))
     assert multiplier.value.tolist() == pytest.approx([0.35, 1.95])
 
 
 @pytest.mark.parametrize("name", ["p3o", "ipo"])
 def test_a_violation_is_needed_for_every_cost(name):
     actor = make_actor()
-    with pytest.raises(ValueError, match="one column per cost limit"):
+    with pytest.raises(ValueError, match="one column per limit"):
         LOSSES[name](actor)(make_batch(actor, [8], 1))
 
 
 def test_before_any_batch_the_policy_counts_as_at_its_limit():
     actor, _, batch = one_state(GAIN, COST)
-    nothing_seen = Constraints({"cost": 25.0})
-    loss = P3OLoss(actor, nothing_seen, kappa=20.0, **FREE)
+    loss = P3OLoss(actor, kappa=20.0, **FREE)
+    with pytest.raises(ValueError, match=r"call prepare\(batch, limits\)"):
+        loss(batch)
+    told(loss, torch.nan, length=torch.nan)
     loss.clip_epsilon.fill_(1e6)
     assert loss(batch)["loss_penalty"].abs() < 1e-5
-    loss = IPOLoss(actor, nothing_seen, kappa=0.5, max_weight=10.0, **FREE)
+    loss = told(IPOLoss(actor, kappa=0.5, max_weight=10.0, **FREE), torch.nan, length=torch.nan)
     loss.clip_epsilon.fill_(1e6)
     # the barrier's tangent at κ / w, extended to 0
     expected = -0.5 * math.log(0.5 / 10.0) + 0.5

@@ -1,48 +1,55 @@
 """PI and PID multipliers by hand, PID by Stooke et al. (algorithm 2)."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from safe_rl.objectives import LimitState
 from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 
 GAINS = {"init": 0.0, "kp": 2.0, "ki": 0.2, "saturation": 1.0, "highest": 5.0}
 
 
+def state(violation, limit=10.0):
+    return LimitState.of(cost=[limit + violation], limit=[limit])
+
+
 def test_two_updates_by_hand():
     multiplier = PIMultiplier(10.0, **GAINS)
-    multiplier.update(5.0)
+    multiplier.update(state(5.0))
     assert multiplier.value.item() == pytest.approx(1.0 + 0.1)
     # a cost of six times the limit counts as one of twice
-    multiplier.update(50.0)
+    multiplier.update(state(50.0))
     assert multiplier.value.item() == pytest.approx(2.0 + 0.3)
     # and one of nothing as half of the limit, where that is the saturation
     multiplier = PIMultiplier(10.0, **(GAINS | {"init": 4.0, "saturation": 0.5}))
-    multiplier.update(-10.0)
+    multiplier.update(state(-10.0))
     assert multiplier.value.item() == pytest.approx(4.0 - 0.1 - 1.0)
 
 
 def test_the_integral_is_not_wound_up_beyond_what_it_can_put_out():
     multiplier = PIMultiplier(25.0, **GAINS)
     for _ in range(200):
-        multiplier.update(75.0)
+        multiplier.update(state(75.0, limit=25.0))
     assert multiplier.value == 5.0
     for _ in range(6):
-        multiplier.update(-25.0)
+        multiplier.update(state(-25.0, limit=25.0))
     assert multiplier.value == pytest.approx(5.0 - 6 * 0.2 - 2.0)
 
 
 def test_ten_times_the_cost_and_the_limit_give_the_same_multiplier():
     small, large = PIMultiplier(25.0, **GAINS), PIMultiplier(250.0, **GAINS)
     for violation in (35.0, 6.0, -13.0, 19.0):
-        small.update(violation)
-        large.update(10 * violation)
+        small.update(state(violation, limit=25.0))
+        large.update(state(10 * violation, limit=250.0))
         torch.testing.assert_close(small.value, large.value)
 
 
-def test_a_limit_of_0_takes_its_unit_from_outside():
+def test_a_limit_of_0_takes_its_unit_from_the_state():
     multiplier = PIMultiplier([0.0, 25.0], **GAINS)
-    multiplier.set_scale(torch.tensor([10.0, 25.0]))
-    multiplier.update([5.0, 12.5])
+    measured = LimitState.of(cost=[5.0, 37.5], limit=[0.0, 25.0])
+    multiplier.update(replace(measured, scale=torch.tensor([10.0, 25.0])))
     assert multiplier.value.tolist() == pytest.approx([1.1, 1.1])
 
 
@@ -56,7 +63,8 @@ def run(costs, limits=10.0, **settings):
     multiplier = PIDMultiplier(limits, **(PLAIN | settings))
     values = []
     for cost in costs:
-        multiplier.update(torch.as_tensor(cost) - multiplier.limits)
+        cost = torch.as_tensor(cost).reshape(multiplier.num_costs)
+        multiplier.update(LimitState.of(cost=cost, limit=multiplier.limits))
         values.append(multiplier.value.squeeze().tolist())
     return values
 

@@ -5,11 +5,17 @@ import torch
 from one_state import minimise, one_state, total
 from point_mass import PointMass
 from run_configs import point_mass_config
-from samples import assert_gradients_are_differences, make_actor, make_batch, perturb
+from samples import (
+    assert_gradients_are_differences,
+    limit_state,
+    make_actor,
+    make_batch,
+    perturb,
+)
 from tensordict import TensorDict
 from torch.distributions import kl_divergence
 
-from safe_rl.algorithms import MinibatchUpdate, OnPolicy, SequentialUpdates
+from safe_rl.algorithms import CUPUpdate, OnPolicy
 from safe_rl.objectives import CUPLoss, PPOLoss, ProjectedMultiplier
 
 FACTOR = (1 - 0.99 * 0.97) / (1 - 0.99)
@@ -28,7 +34,7 @@ def moved_case(batch_size=(32,)):
     batch = make_batch(actor, list(batch_size), 2)
     perturb(actor, 0.1)
     loss = cup_loss(actor, 0.5, 2.0)
-    loss.anchor(batch)
+    loss.prepare(batch, limit_state(*[0.0] * batch["cost_advantage"].shape[-1]))
     half = actor.get_dist(batch.select("observation"))
     perturb(actor, 0.1)
     return actor, batch, loss, half
@@ -65,22 +71,28 @@ def test_the_projection_has_the_optimum_of_its_equation():
     half = torch.tensor([0.5, 0.1, -0.4, 0.2])
     with torch.no_grad():
         logits.copy_(half)
-    loss.anchor(batch)
+    loss.prepare(batch, limit_state(*[0.0] * batch["cost_advantage"].shape[-1]))
     minimise(loss, logits, batch)
     expected = (half - 0.15 * FACTOR * torch.tensor(costs)).softmax(0)
     torch.testing.assert_close(logits.detach().softmax(0), expected, atol=1e-4, rtol=0)
 
 
+SETTINGS = {"optimizer": torch.optim.SGD, "num_passes": 3, "minibatch_size": 16}
+
+
+def cup_update(actor, weight, **changed):
+    multiplier = ProjectedMultiplier([25.0], init=weight, lr=0.01, highest=None)
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    return CUPUpdate(loss, multiplier, gamma=0.99, lmbda=0.97, **(SETTINGS | changed))
+
+
 def test_without_a_weight_the_projection_stays_where_the_first_step_has_led():
-    actor = make_actor()
-    batch = make_batch(actor, [64], 1)
-    settings = {"optimizer": torch.optim.SGD, "num_passes": 3, "minibatch_size": 16}
-    first = MinibatchUpdate(PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0), **settings)
     seen = {}
     for weight in (0.0, 1.0):
-        loss = cup_loss(actor, weight, entropy_coeff=0.0)
-        update = SequentialUpdates(first, {"projection": MinibatchUpdate(loss, **settings)})
-        seen[weight] = update(batch)
+        torch.manual_seed(0)
+        actor = make_actor()
+        batch = make_batch(actor, [64], 1)
+        seen[weight] = cup_update(actor, weight)(batch, limit_state(0.0))
     assert seen[0.0]["kl"] > 0
     assert seen[0.0]["projection_kl"] < 1e-6 < seen[1.0]["projection_kl"]
     assert seen[1.0]["cost_surrogate"] < seen[0.0]["cost_surrogate"]
@@ -91,31 +103,21 @@ def test_the_first_step_of_a_run_knows_no_costs():
     """Also where a multiplier is at hand."""
     overrides = ("algo=cup", "cost_limits={cost_north: 1}")
     algorithm = OnPolicy.from_config(point_mass_config(*overrides), PointMass(2))
-    first, projection = (
-        update.loss
-        for update in (algorithm.policy_update.first, algorithm.policy_update.then["projection"])
-    )
-    assert algorithm.constraints.multiplier is projection.multiplier
+    first, projection = algorithm.policy_update.loss_modules().values()
+    assert algorithm.multiplier is projection.multiplier
     assert first.multiplier is None
     assert "cost_advantage" not in first.in_keys
     assert first.actor_network is projection.actor_network is algorithm.actor
 
 
-def test_updates_in_turn_resume_by_name():
+def test_both_optimisers_resume():
     actor = make_actor()
     batch = make_batch(actor, [16], 1)
-    settings = {"optimizer": torch.optim.Adam, "num_passes": 1, "minibatch_size": None}
-
-    def both():
-        loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
-        second = MinibatchUpdate(cup_loss(actor, 1.0), **settings)
-        return SequentialUpdates(MinibatchUpdate(loss, **settings), {"projection": second})
-
-    update, twin = both(), both()
-    update(batch)
+    update, twin = (cup_update(actor, 1.0, optimizer=torch.optim.Adam) for _ in range(2))
+    update(batch, limit_state(0.0))
     twin.load_state_dict(update.state_dict())
-    for own, others in ((twin.first, update.first), (*twin.then.values(), *update.then.values())):
-        state, expected = (each.optimizer.state_dict()["state"] for each in (own, others))
+    for resumed, saved in ((twin, update), (twin.projection, update.projection)):
+        state, expected = (each.optimizer.state_dict()["state"] for each in (resumed, saved))
         assert state
         assert torch.equal(state[0]["exp_avg"], expected[0]["exp_avg"])
 

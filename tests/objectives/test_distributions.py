@@ -5,7 +5,7 @@ import functools
 import pytest
 import torch
 from policy_kinds import ACTIONS, COMPOSITE, KINDS, SAMPLED_KL, make_actor, make_case
-from samples import NUM_OBS, assert_gradients_are_differences, perturb
+from samples import NUM_OBS, assert_gradients_are_differences, limit_state, perturb
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, set_composite_lp_aggregate
 from torch import nn
@@ -226,7 +226,7 @@ def test_every_update_takes_every_policy(kind):
     adam = functools.partial(torch.optim.Adam, lr=1e-2)
     update = MinibatchUpdate(ppo, optimizer=adam, num_passes=10, minibatch_size=None)
     before = ppo(batch)["loss_objective"].item()
-    assert update(batch)["num_steps"] == 10
+    assert update(batch, limit_state(0.0))["num_steps"] == 10
     assert ppo(batch)["loss_objective"] < before
     for step, violation in (
         (TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS), None),
@@ -235,8 +235,8 @@ def test_every_update_takes_every_policy(kind):
         with torch.no_grad():  # another batch, of the policy as it is
             batch = actor(batch.select("observation", "advantage", "cost_advantage"))
         start = step.loss(batch)["loss_objective"].item()
-        given = () if violation is None else (torch.tensor([violation]), torch.tensor(50.0))
-        metrics = step(batch, *given)
+        state = None if violation is None else limit_state(violation, length=50.0)
+        metrics = step(batch, state)
         assert metrics["step_fraction"] > 0
         assert 0 < metrics["kl"] <= SETTINGS["target_kl"]
         assert step.loss(batch)["loss_objective"] < start
@@ -288,7 +288,7 @@ def test_choices_that_are_masked_leave_the_gradient_of_a_divergence_a_number(kin
     batch["advantage"], batch["cost_advantage"] = torch.randn(2, 32, 1).double()
     multiplier = LagrangeMultiplier([1.0], init=1.0, lr=0.1)
     loss = kind(actor, multiplier, **PROJECTIONS[kind], entropy_coeff=0.1)
-    loss.anchor(batch)
+    loss.prepare(batch, limit_state(0.0))
     perturb(actor, 0.3)
 
     def total():

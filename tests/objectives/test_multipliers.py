@@ -1,10 +1,12 @@
 """Multipliers against hand-computed numbers and against torch's own Adam."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
+from samples import limit_state
 
 from safe_rl.objectives import Multiplier, PIDMultiplier, PIMultiplier, ProjectedMultiplier
 from safe_rl.objectives.multipliers import LagrangeMultiplier, parse_cost_limits
@@ -29,17 +31,17 @@ def test_matches_torch_adam_on_the_dual_loss():
         adam.zero_grad()
         (-nu * violation).sum().backward()
         adam.step()
-        multiplier.update(violation)
+        multiplier.update(limit_state(*violation.tolist()))
     torch.testing.assert_close(multiplier.nu, nu.detach())
 
 
 def test_nan_leaves_only_that_cost_unchanged():
     multiplier, single = lagrange([25.0, 5.0]), lagrange([25.0])
     for known, unknown in ((15.0, 4.0), (5.0, math.nan), (-15.0, math.nan)):
-        multiplier.update([known, unknown])
-        single.update([known])
+        multiplier.update(limit_state(known, unknown))
+        single.update(limit_state(known))
     after_one = lagrange([5.0])
-    after_one.update([4.0])
+    after_one.update(limit_state(4.0))
     torch.testing.assert_close(multiplier.nu, torch.cat([single.nu, after_one.nu]))
     torch.testing.assert_close(multiplier.step, torch.tensor([3.0, 1.0]))
 
@@ -57,14 +59,15 @@ KINDS = {
 def test_nan_leaves_everything_unchanged_and_resume_is_exact(kind):
     multiplier, resumed = (KINDS[kind]([limit, 5.0]) for limit in (10.0, 1.0))
     for violation in ([4.0, 2.0], [23.0, 8.0]):
-        multiplier.update(violation)
+        multiplier.update(limit_state(*violation))
     before = {name: buffer.clone() for name, buffer in multiplier.state_dict().items()}
-    multiplier.update([math.nan] * 2)
+    multiplier.update(limit_state(math.nan, math.nan))
+    multiplier.update(replace(limit_state(5.0, 5.0), is_new=False))
     for name, buffer in multiplier.state_dict().items():
         assert torch.equal(buffer, before[name])
     resumed.load_state_dict(before)
     for each in (multiplier, resumed):
-        each.update([10.0, 8.0])
+        each.update(limit_state(10.0, 8.0))
     assert torch.equal(multiplier.value, resumed.value)
     assert multiplier.value[0] > 0
 
@@ -97,7 +100,7 @@ def test_limits_keep_their_keys(limits, keys):
         (lambda: lagrange([math.inf]), "finite"),
         (lambda: lagrange(init=0.0), "above 0"),
         (lambda: lagrange([1.0, 2.0], init=[1.0, 1.0, 1.0]), "2 numbers"),
-        (lambda: lagrange([1.0, 2.0]).update([1.0]), "each of"),
+        (lambda: lagrange([1.0, 2.0]).update(limit_state(1.0)), "each of"),
         (lambda: KINDS["pid"](0.0), "limit of 0"),
     ],
 )

@@ -4,7 +4,7 @@ import functools
 
 import pytest
 import torch
-from samples import make_actor, make_batch, make_critic, make_rollout
+from samples import limit_state, make_actor, make_batch, make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.collectors.utils import split_trajectories
 from torchrl.objectives.value import GAE
@@ -131,7 +131,7 @@ def test_updates(kind, key):
             batches[1].rename_key_(("collector", "mask"), key)
         update = make_update(kind, actor)
         update.loss.loss_mask_key = key
-        metrics = update(batches[index], torch.tensor([-1.0]), torch.tensor(20.0))
+        metrics = update(batches[index], limit_state(-1.0, length=20.0))
         ess = update.loss(batches[index])["ESS"]
         results.append(([p.detach().clone() for p in actor.parameters()], metrics["kl"], ess))
     torch.testing.assert_close(results[0], results[1])

@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch._dynamo.testing
-from samples import make_actor, make_batch, perturb
+from samples import limit_state, make_actor, make_batch, perturb
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.objectives.multipliers import LagrangeMultiplier
@@ -84,6 +84,7 @@ def test_compiles_in_one_graph_that_is_never_recompiled():
     batch = make_batch(actor, [64], 2)
     perturb(actor)
     loss = make_lagrangian(actor)
+    loss.prepare(batch, limit_state(0.0, 0.0))
     counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
     compiled = torch.compile(loss, fullgraph=True, backend=counter)
     for epoch in range(4):
@@ -93,7 +94,9 @@ def test_compiles_in_one_graph_that_is_never_recompiled():
             torch.testing.assert_close(losses[key], expected[key])
         compiled_gradient = gradient(losses["loss_objective"], actor)
         torch.testing.assert_close(compiled_gradient, gradient(expected["loss_objective"], actor))
-        loss.multiplier.update([35.0 + epoch, -4.0])
+        state = limit_state(35.0 + epoch, -4.0, unit=[2.0, 0.5 + epoch])
+        loss.multiplier.update(state)
+        loss.prepare(batch, state)
         loss.clip_epsilon, loss.entropy_coeff = 0.1 / (epoch + 1), 0.02 / (epoch + 1)
         perturb(actor)
         batch = make_batch(actor, [64], 2)

@@ -5,6 +5,7 @@ import pickle
 
 import pytest
 import torch
+from samples import limit_state
 from tensordict import TensorDict
 from torch import nn
 from torchrl import objectives
@@ -48,6 +49,14 @@ def make_q(networks=2, **keys):
     return QEnsemble(3, 2, hidden_sizes=[8], num_networks=networks, **keys)
 
 
+def told(loss, unit, rewards=()):
+    """The loss, which knows the size of one cost, and these rewards."""
+    rewards = torch.as_tensor(rewards).reshape(-1, 1)
+    batch = TensorDict({"next": {"reward": rewards}}, rewards.shape[:1])
+    loss.prepare(batch, limit_state(*[0.0] * len(unit), unit=unit))
+    return loss
+
+
 def make_loss(kind, multiplier=None, networks=2, **keys):
     make_own, settings, plain, constrained = {
         "sac": (make_squashed_actor, SAC, SACLoss, SACLagrangianLoss),
@@ -58,9 +67,10 @@ def make_loss(kind, multiplier=None, networks=2, **keys):
     if multiplier is None:
         return plain(actor, make_q(), **settings, **keys)
     cost_q = make_q(networks, num_outputs=2, out_key="cost_value")
-    return constrained(
+    loss = constrained(
         actor, make_q(), cost_q, multiplier=multiplier, cost_keys=COSTS, **settings, **keys
     )
+    return told(loss, [1.0, 1.0])
 
 
 def lagrange(*values):
@@ -138,8 +148,7 @@ def test_scripts_of_torchrls_td3_find_the_two_losses():
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     loss, steps = make_loss(kind, lagrange(2.0, 3.0), pessimism=0.5), make_steps()
-    loss.cost_unit.copy_(torch.tensor([1.0, 0.5]))
-    loss.reward_unit.fill_(0.25)
+    told(loss, [1.0, 0.5], rewards=[-0.25, 0.25])
     torch.manual_seed(1)
     found = loss.actor_losses(steps)
     stock = as_stock(loss, kind)
@@ -160,11 +169,22 @@ def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
 def test_the_size_of_rewards_is_the_deviation_of_all_so_far():
     loss, rewards = make_loss("sac", lagrange(1.0, 1.0)), 1000 + 7 * torch.randn(300, 1)
     for batch in rewards.split([50, 150, 100]):
-        loss.measure(batch.reshape(-1, 10, 1))
+        told(loss, [1.0, 1.0], rewards=batch)
     assert loss.reward_unit.item() == pytest.approx(rewards.numpy().std(), rel=1e-5)
     loss = make_loss("sac", lagrange(1.0, 1.0))
-    loss.measure(torch.full((275, 1), 0.1))  # so many that their sums are not exact
+    told(
+        loss, [1.0, 1.0], rewards=torch.full((275, 1), 0.1)
+    )  # so many that their sums are not exact
     assert loss.reward_unit == 1
+
+
+def test_a_loss_that_knows_no_scales_says_so():
+    loss = SACLagrangianLoss(
+        make_squashed_actor(3, *BOUNDS, hidden_sizes=[8]), make_q(), make_q(num_outputs=2),
+        multiplier=lagrange(1.0, 1.0), cost_keys=COSTS, **SAC,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"call prepare\(batch, limits\) with every batch"):
+        loss(make_steps())
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])

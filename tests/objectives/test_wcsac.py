@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from samples import assert_gradients_are_differences
+from samples import assert_gradients_are_differences, limit_state
 from scipy import integrate, stats
 from tensordict import TensorDict
 from torchrl.data import Bounded
@@ -23,10 +23,13 @@ def make_loss(observed=3, hidden=(8,), kind=WCSACLoss, networks=2, costs=("cost"
         for number, more in ((2, {}), (networks, {"num_outputs": len(costs), "out_key": "costs"}))
     ]
     multiplier = LagrangeMultiplier(dict.fromkeys(costs, 25.0), init=2.0, lr=0.05)
-    return kind(
+    loss = kind(
         make_squashed_actor(observed, *BOUNDS, hidden_sizes=[8]), *q,
         multiplier=multiplier, cost_keys=costs, **SETTINGS, **keys,
     )  # fmt: skip
+    nothing = TensorDict({"next": {"reward": torch.empty(0, 1)}}, [0])
+    loss.prepare(nothing, limit_state(*[0.0] * len(costs)))
+    return loss
 
 
 def make_steps(observations, following, costs, terminated):

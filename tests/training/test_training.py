@@ -183,8 +183,8 @@ class ReportingUpdate(PolicyUpdate):
     def __init__(self, loss):
         self.loss = loss
 
-    def __call__(self, batch, cost_violation, episode_length):
-        return {"violation": cost_violation, "length": episode_length}
+    def __call__(self, batch, limits):
+        return {"violation": limits.required_decrease, "length": limits.length}
 
     def state_dict(self):
         return {}
@@ -198,7 +198,7 @@ class ForeignUpdate:
 
     def __init__(self, **objects): ...
 
-    def __call__(self, batch, cost_violation, episode_length):
+    def __call__(self, batch, limits):
         return {}
 
 
@@ -248,7 +248,7 @@ def test_a_loss_from_outside_the_package(tmp_path):
     trainer, table = train(tmp_path / "run", *own, "cost_limits={cost: 1}")
     loss = trainer.algorithm.policy_update.loss
     assert loss.penalty == 3.0
-    assert loss.multiplier is trainer.algorithm.constraints.multiplier
+    assert loss.multiplier is trainer.algorithm.multiplier
     assert len(set(table["multiplier_cost"])) == 8
 
 
