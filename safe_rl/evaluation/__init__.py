@@ -6,7 +6,8 @@ from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.lazy import import_later
 
 if TYPE_CHECKING:
-    from safe_rl.evaluation.certifying import Certificate, certify
+    from safe_rl.evaluation.certificate import Certificate
+    from safe_rl.evaluation.certifying import certify
     from safe_rl.evaluation.episodes import Episodes, collect_episodes
     from safe_rl.evaluation.measuring import Evaluation, evaluate, summarise
 
@@ -25,7 +26,8 @@ __all__ = [
 __getattr__, __dir__ = import_later(
     __name__,
     {
-        "certifying": ["Certificate", "certify"],
+        "certificate": ["Certificate"],
+        "certifying": ["certify"],
         "episodes": ["Episodes", "collect_episodes"],
         "measuring": ["Evaluation", "evaluate", "summarise"],
     },

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,75 +16,23 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
-from safe_rl.files import check_no_links, replace_json, replacing
+from safe_rl.files import check_no_links, read_json, replace_json, replacing
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
-from safe_rl.scores.bounds import rounded_up
-from safe_rl.scores.certificate import Claim, Verdict, first_certified, rank
+from safe_rl.scores.certificate import Claim, error_of_next_test, first_certified, rank
 
 # number of environments that are stepped together, and of episodes between two checks of a test;
 # MuJoCo Warp takes nearly the same time for a thousand environments as for a hundred
 _BATCH, _BATCH_OF_WARP = 100, 1_000
 # added to the seed: so far apart that no test of a run has the episodes of another run's ranking
-_RANKING, _TEST = 100_000_000_003, 200_000_000_041
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """The result of certifying a run.
-
-    Attributes:
-        checkpoint: The policy that is certified, or None.
-        episode_return: Its mean return in the test.
-        verdict: Bounds, tests and shortfalls.
-        options: Options of the test.
-    """
-
-    checkpoint: Path | None
-    episode_return: float
-    verdict: Verdict
-    options: CertificateOptions
-
-    def __str__(self) -> str:
-        """One line: what is certified, and what the bounds do not cover."""
-        actions = "mean" if self.options.deterministic else "sampled"
-        level = f"at {100 * self.options.level:.12g}% with {actions} actions"
-        verdict = self.verdict
-        if self.checkpoint is None:
-            missing = "; ".join(
-                f"{name} ≤ {rounded_up(bound):.3g}, limit {most:g}, mean {verdict.means[name]:.3g}"
-                for name, (bound, most) in verdict.bounds.items()
-                if name in verdict.shortfalls
-            )
-            return (
-                f"Not certified {level}: no checkpoint's bound is within its limit ({missing}; "
-                f"{verdict.episodes:,} new episodes)."
-            )
-        shown = {name: rounded_up(bound) for name, (bound, _) in verdict.bounds.items()}
-        bounds = ", ".join(f"{name} ≤ {bound:.3g}" for name, bound in shown.items())
-        means = ", ".join(f"{mean:.3g}" for mean in verdict.means.values())
-        return (
-            f"Certified {level}: {bounds} ({means} in {verdict.episodes:,} new episodes), return "
-            f"{self.episode_return:.2f}, at {checkpoint_steps(self.checkpoint):,} steps. "
-            f"{self._on_rare_episodes()} Not covered: single episodes, other environments."
-        )
-
-    def _on_rare_episodes(self) -> str:
-        """Text on what the bounds say about rare episodes."""
-        said = []
-        if capped := ", ".join(name for name in self.verdict.bounds if name.startswith("beyond_")):
-            said.append(
-                f"Costs beyond a cap are not counted ({capped}: the share of such episodes)."
-            )
-        if self.options.bound == "student":
-            said.append("The bound assumes that no rare episodes cost far more than those tested.")
-        if said:
-            return " ".join(said)
-        most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
-        return f"The bound includes rare episodes that cost up to {most}."
+_RANKING, _TEST, _AFTER = 100_000_000_003, 200_000_000_041, 300_000_000_077
+# of two batches, which have new instances of the environment; of two tests of a run
+_NEXT_BATCH, _NEXT_TEST = 1_000_003, 1_000_000_000_039
+_ROUNDS = (0.25, 0.25, 0.5)  # shares of the ranking's episodes in its rounds
 
 
 def certify(
@@ -99,6 +47,8 @@ def certify(
 
     All checkpoints are ranked by some episodes; the first ones are tested on new episodes. The
     result is written to ``certificate.json``, and the policy is saved as ``checkpoint=certified``.
+    The level is that of all tests of the run together: each spends a part of the error, which the
+    run's folder keeps. The same test of the same checkpoints is repeated, and spends nothing.
 
     Args:
         directory: Folder of the run.
@@ -109,12 +59,14 @@ def certify(
 
     Returns:
         The certificate; None if the run has no limits or no checkpoints.
+
+    Raises:
+        ValueError: If earlier tests of the run have spent more error than the level allows.
     """
     run = Run(directory)
-    config = run.config
+    config, limits = run.config, run.cost_limits
     check_no_links(directory)
     candidates = _candidates(run)
-    limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     if not limits or not candidates:
         return None
     # the device of training, where the simulation may run; without a GPU, the CPU
@@ -123,36 +75,90 @@ def certify(
         device=device, num_threads=num_threads, deterministic=options.deterministic
     )
     trials = [Trial(config, path, plain, make_env) for path in candidates]
-    asked = ("most_over", "level", "bound", "cap", "most_beyond", "tail")
+    asked = ("most_over", "bound", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in asked})
-    groups = [trials] if _has_warp(trials[0]) else [[trial] for trial in trials]
-    first: list[Episodes] = []
-    for group in groups:
-        highest, found = next(_run(group, _RANKING, options.ranking, progress))
-        first += found
-    costs = [_costs(episodes) for episodes in first]
-    claim = replace(claim, highest=highest)
-    claims = [claim.with_thresholds(costs_of_one) for costs_of_one in costs]
-    returns: dict[int, list[torch.Tensor]] = {}
+    number, error = _spend(run, options, candidates)
+    claim = replace(claim, level=1 - error)
+    order, claims = _ranked(trials, claim, options, progress)
+    seed = _TEST + (number - 1) * _NEXT_TEST
 
-    def collect(number: int) -> Iterator[dict[str, np.ndarray]]:
-        for _, (episodes,) in _run([trials[number]], _TEST, options.episodes, progress):
-            returns.setdefault(number, []).append(episodes.returns)
+    def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
+        for _, (episodes,) in _run([trials[candidate]], seed, options.episodes, progress):
             yield _costs(episodes)
 
-    order = rank([episodes.returns.numpy() for episodes in first], costs, claims)
     verdict = first_certified(order, collect, claims, options.tests, options.episodes)
-    kept, episode_return = None, math.nan
-    if verdict.certified is not None:
-        kept = candidates[verdict.certified]
-        episode_return = torch.cat(returns[verdict.certified]).mean().item()
-    certificate = Certificate(_keep(run, kept), episode_return, verdict, options)
+    fewest = claims[order[0]].fewest(options.tests)
+    certificate = Certificate(None, math.nan, verdict, options, test=number, fewest=fewest)
+    if (chosen := verdict.certified) is not None:
+        # episodes of the test have decided when it ended: it ends when costs happen to be low
+        batch = _BATCH_OF_WARP if _has_warp(trials[chosen]) else _BATCH
+        _, (after,) = next(_run([trials[chosen]], seed - _TEST + _AFTER, batch, progress))
+        found = claims[chosen].statements(_costs(after))
+        certificate = replace(
+            certificate,
+            checkpoint=candidates[chosen],
+            episode_return=after.returns.mean().item(),
+            means={one.name: float(one.values.mean()) for one in found},
+            further=len(after.returns),
+        )
+    certificate = replace(certificate, checkpoint=_keep(run, certificate.checkpoint))
     _write(run, certificate, [checkpoint_steps(path) for path in candidates])
     return certificate
 
 
-def _costs(episodes: Episodes) -> dict[str, np.ndarray]:
-    return {key: costs.numpy() for key, costs in episodes.costs.items()}
+def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) -> tuple[int, float]:
+    """Number and error probability of a test of a run; both are noted before its first episode."""
+    tests = read_json(run.tests_file) if run.tests_file.is_file() else []
+    asked = {"options": asdict(options), "candidates": [path.name for path in candidates]}
+    for number, former in enumerate(tests, 1):
+        if all(former[key] == value for key, value in asked.items()):
+            return number, former["error"]
+    spent = [former["error"] for former in tests]
+    error = error_of_next_test(options.level, spent)
+    if error <= 0:
+        raise ValueError(
+            f"level={options.level:g}: earlier tests of this run have spent an error of "
+            f"{sum(spent):.3g}. All of its tests together can have a level below "
+            f"{1 - sum(spent):.5g}: certificate.level={1 - 2 * sum(spent):.3g}"
+        )
+    replace_json(run.tests_file, [*tests, {**asked, "error": error}])
+    return len(tests) + 1, error
+
+
+def _ranked(
+    trials: Sequence[Trial], claim: Claim, options: CertificateOptions, progress: bool
+) -> tuple[list[int], list[Claim]]:
+    """Order candidates for the tests; returns their numbers, and the claim about each of them.
+
+    In every round the worse half of the candidates is given up (successive halving), as long as
+    more are left than can be tested. A simulation that all of them share has one round.
+    """
+    together = _has_warp(trials[0])
+    rounds = [options.ranking]
+    if not together and options.ranking >= 4 / min(_ROUNDS) and len(trials) > options.tests:
+        rounds = [int(share * options.ranking) for share in _ROUNDS]
+        rounds[-1] = options.ranking - sum(rounds[:-1])
+    found: list[list[Episodes]] = [[] for _ in trials]
+    left, given_up = list(range(len(trials))), []
+    for part, number in enumerate(rounds):
+        seed = _RANKING + part * _NEXT_BATCH
+        for group in [left] if together else [[one] for one in left]:
+            highest, episodes = next(_run([trials[one] for one in group], seed, number, progress))
+            for one, own in zip(group, episodes, strict=True):
+                found[one].append(own)
+        claim = replace(claim, highest=highest)
+        costs = [_costs(*own) for own in found]
+        claims = [claim.with_thresholds(own) for own in costs]
+        returns = [torch.cat([part.returns for part in own]).numpy() for own in found]
+        order = rank(*([values[one] for one in left] for values in (returns, costs, claims)))
+        left = [left[place] for place in order]
+        kept = max(options.tests, -(-len(left) // 2)) if part + 1 < len(rounds) else len(left)
+        left, given_up = left[:kept], left[kept:] + given_up
+    return left + given_up, claims
+
+
+def _costs(*parts: Episodes) -> dict[str, np.ndarray]:
+    return {key: np.concatenate([part.costs[key] for part in parts]) for key in parts[0].costs}
 
 
 def _candidates(run: Run) -> list[Path]:
@@ -169,40 +175,43 @@ def _has_warp(trial: Trial) -> bool:
 def _run(
     trials: list[Trial], purpose: int, number: int, progress: bool
 ) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
-    """Batches of episodes with seeds that neither training nor the other purpose uses, per trial.
+    """Batches of episodes with seeds that neither training nor another purpose uses, per trial.
 
-    A purpose is a ranking or a test. A ranking is one batch. In a batch of a test every environment
-    has one episode, so short episodes do not count before long ones. Trials of one call share the
-    environments of one simulation; trials of several calls have the same layouts. Every batch comes
-    with the highest possible costs of an episode.
+    A round of the ranking is one batch. In a batch of a test every environment has one episode, so
+    short episodes do not count before long ones. Every batch has new instances of the environment:
+    episodes of one instance are not independent if it draws constants when it is made. Only a fixed
+    layout, which is such a constant, is kept. Trials of one call share one simulation; those of
+    several calls have the same layouts. With a batch come the highest possible costs of an episode.
     """
     trial, together = trials[0], len(trials)
-    own = trial.seed  # if the layout is fixed, the seed of training
-    seed = own if has_fixed_layout(trial.node) else own + purpose
-    trial = replace(trial, options=replace(trial.options, seed=seed))
+    own, is_fixed = trial.seed, has_fixed_layout(trial.node)  # if fixed, the seed of training
     most = _BATCH_OF_WARP if _has_warp(trial) else _BATCH
-    batch = number if purpose == _RANKING else min(number, most)
+    batch = number if purpose < _TEST else min(number, most)
     worlds = batch if together > 1 else min(number, most)
     keys = list(trial.config.cost_limits)
-    with (
-        closing(trial.make(worlds * together)) as env,
-        tqdm(total=number, disable=None if progress else True) as bar,
-    ):
-        highest = {key: env.highest_cost(key) for key in keys}
-        policy = _side_by_side([each.policy(env) for each in trials])
-        torch.manual_seed(own + purpose)
-        for _ in range(math.ceil(number / batch)):
+    torch.manual_seed(own + purpose)
+    with ExitStack() as stack, tqdm(total=number, disable=None if progress else True) as bar:
+        for part in range(math.ceil(number / batch)):
+            if part == 0 or not is_fixed:
+                stack.close()
+                seed = own if is_fixed else own + purpose + part * _NEXT_BATCH
+                changed = replace(trial, options=replace(trial.options, seed=seed))
+                env = stack.enter_context(closing(changed.make(worlds * together)))
+                policy = _side_by_side([each.policy(env) for each in trials])
+                highest = {key: env.highest_cost(key) for key in keys}
             found = collect_episodes(
                 env, policy, batch * together, keys, deterministic=trial.options.deterministic
             )
             # sorted by environment, so those of a trial follow each other
             columns = [found.returns, found.lengths, *found.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)
-            episodes = [
-                Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
-                for returns, lengths, *costs in parts
-            ]
-            yield highest, episodes
+            yield (
+                highest,
+                [
+                    Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
+                    for returns, lengths, *costs in parts
+                ],
+            )
             bar.update(batch)
 
 
@@ -243,6 +252,9 @@ def _write(run: Run, certificate: Certificate, candidates: list[int | None]) -> 
         "certified": certificate.checkpoint is not None,
         "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
         "episode_return": certificate.episode_return,
+        "means": dict(certificate.means),
+        "further_episodes": certificate.further,
+        "test": certificate.test,
         "bounds": {
             name: {"bound": bound, "most": most} for name, (bound, most) in verdict.bounds.items()
         },

@@ -86,6 +86,7 @@ class Run:
     transitions_folder = _Below("transitions")  # collected transitions, if they were recorded
     certifying_file = _Below(".certifying")  # exists between training and certificate
     certificate_file = _Below("certificate.json")  # which checkpoint is certified
+    tests_file = _Below("certificate_tests.json")  # the error that the tests of it have spent
 
     def __init__(self, directory: Path | str, **contents: Any) -> None:
         self.directory = Path(directory)

@@ -1,8 +1,9 @@
-"""Upper confidence bounds of means: by betting, which holds for bounded values, and Student's."""
+"""Upper confidence bounds of means, by betting and Student's, and statements about means."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from decimal import ROUND_CEILING, Context
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 # episode's highest cost is usually far above the limit, and then large bets are the best ones
 _BETS = np.array([0.99, 0.7, 0.4, 0.2, 0.08, 0.03])
 _WEIGHTS = np.array([4, 2, 1, 1, 1, 1]) / 10
+_MOST_EPISODES = 2**22  # of a test whose number of episodes is sought
 
 
 def rounded_up(bound: float, digits: int = 3) -> float:
@@ -128,3 +130,73 @@ def student_bound(values: ArrayLike, level: float) -> float:
     quantile = float(scipy.stats.t.ppf(level, number - 1))
     correction = 2 * max(0.0, skewness) * (1 + 2 * quantile**2) / (6 * math.sqrt(number))
     return float(mean + (quantile + correction) * spread / math.sqrt(number))
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The statement that the mean over episodes of a value, such as the cost, is at most a limit.
+
+    Attributes:
+        name: Name of the mean.
+        limit: Limit of the mean.
+        highest: The largest possible value.
+        values: Value of every episode, [E].
+        is_share: Whether values are 0 or 1.
+    """
+
+    name: str
+    limit: float
+    highest: float
+    values: np.ndarray
+    is_share: bool = False
+
+    @property
+    def is_by_construction(self) -> bool:
+        """Whether no value can exceed the limit, so that no episode has to show it."""
+        return self.highest <= self.limit
+
+    def fewest(self, level: float) -> float:
+        """Number of episodes after which betting shows it if all values are the lowest of these.
+
+        It is infinite if that value is not below the limit.
+        """
+        if self.is_by_construction:
+            return 1
+        lowest, needed, number = float(self.values.min()), -math.log(1 - level), 1
+        while lowest < self.limit and number < _MOST_EPISODES:
+            number *= 2
+            is_shown = log_wealth(np.full(number, lowest), self.limit, self.highest) >= needed
+            if is_shown[-1]:
+                return int(np.argmax(is_shown)) + 1
+        return math.inf
+
+    def bound(self, level: float, kind: str) -> float:
+        """Upper confidence bound of the mean; `kind` is "betting" or "student"."""
+        if kind == "student" and self.is_share:
+            # exact (Clopper and Pearson 1934)
+            over = int(self.values.sum())
+            test = scipy.stats.binomtest(over, len(self.values), alternative="less")
+            return float(test.proportion_ci(level, method="exact").high)
+        if kind == "student":
+            # a cost that is infinite or NaN has no bound
+            most = float(np.max(self.values, initial=self.highest))
+            return min(student_bound(self.values, level), most)
+        return betting_bound(self.values, level, self.highest)
+
+    def is_shown(self, level: float) -> bool:
+        """Whether the betting bound is within the limit, without computing it."""
+        if self.is_by_construction or not np.isfinite(self.values).all():
+            return self.bound(level, "betting") <= self.limit
+        return bool(log_wealth(self.values, self.limit, self.highest)[-1] >= -math.log(1 - level))
+
+    def is_hopeless(self, level: float, most: int) -> bool:
+        """Whether the test will probably fail with this total number of episodes.
+
+        This is the case if the log wealth of the best bet is less than a quarter of what it needs,
+        in proportion to the episodes so far. This does not make a wrong certificate more likely,
+        because a test may be given up at any time.
+        """
+        if self.is_by_construction:
+            return False
+        needed = -math.log(1 - level) * len(self.values) / most
+        return best_growth(self.values, self.limit, self.highest) < needed / 4

@@ -12,64 +12,36 @@ from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import numpy as np
-import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
-from safe_rl.scores.bounds import best_growth, betting_bound, log_wealth, student_bound
+from safe_rl.scores.bounds import Statement
 
-__all__ = ["Claim", "Statement", "Verdict", "first_certified", "rank"]
+__all__ = ["Claim", "Verdict", "error_of_next_test", "first_certified", "rank"]
 
 Costs = Mapping[str, ArrayLike]
 
+_SPENT_AT_ONCE = 0.75  # share of the error left that one test spends; the first loses little by it
 
-@dataclass(frozen=True)
-class Statement:
-    """The statement that the mean over episodes of a value, such as the cost, is at most a limit.
 
-    Attributes:
-        name: Name of the mean.
-        limit: Limit of the mean.
-        highest: The largest possible value.
-        values: Value of every episode, [E].
-        is_share: Whether values are 0 or 1.
+def error_of_next_test(level: float, spent: Iterable[float]) -> float:
+    """Error probability of the next test of a run, such that all of its tests share one level.
+
+    Every test spends three quarters of the error that earlier ones have left. The sum of all errors
+    stays below 1 − ``level``, however many tests there are and whatever decides on them.
+
+    Args:
+        level: Confidence over all tests of the run.
+        spent: Error probabilities of its earlier tests.
+
+    Returns:
+        The error probability; 0 or less if earlier tests have spent all of it.
+
+    Examples:
+        >>> first = error_of_next_test(0.95, [])
+        >>> round(first, 4), round(error_of_next_test(0.95, [first]), 4)
+        (0.0375, 0.0094)
     """
-
-    name: str
-    limit: float
-    highest: float
-    values: np.ndarray
-    is_share: bool = False
-
-    def bound(self, level: float, kind: str) -> float:
-        """Upper confidence bound of the mean; `kind` is "betting" or "student"."""
-        if kind == "student" and self.is_share:
-            # exact (Clopper and Pearson 1934)
-            over = int(self.values.sum())
-            test = scipy.stats.binomtest(over, len(self.values), alternative="less")
-            return float(test.proportion_ci(level, method="exact").high)
-        if kind == "student":
-            # a cost that is infinite or NaN has no bound
-            most = float(np.max(self.values, initial=self.highest))
-            return min(student_bound(self.values, level), most)
-        return betting_bound(self.values, level, self.highest)
-
-    def is_shown(self, level: float) -> bool:
-        """Whether the betting bound is within the limit, without computing it."""
-        if self.highest <= self.limit or not np.isfinite(self.values).all():
-            return self.bound(level, "betting") <= self.limit
-        return bool(log_wealth(self.values, self.limit, self.highest)[-1] >= -math.log(1 - level))
-
-    def is_hopeless(self, level: float, most: int) -> bool:
-        """Whether the test will probably fail with this total number of episodes.
-
-        This is the case if the log wealth of the best bet is less than a quarter of what it needs,
-        in proportion to the episodes so far. This does not make a wrong certificate more likely,
-        because a test may be given up at any time.
-        """
-        if self.highest <= self.limit:
-            return False
-        needed = -math.log(1 - level) * len(self.values) / most
-        return best_growth(self.values, self.limit, self.highest) < needed / 4
+    return _SPENT_AT_ONCE * (1 - level - sum(spent))
 
 
 @dataclass(frozen=True)
@@ -172,6 +144,17 @@ class Claim:
         bounds = self.bounds(costs, tests)
         return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
+    def fewest(self, tests: int) -> float:
+        """Number of episodes below which no test can succeed, even if no episode costs anything.
+
+        With Student's bound it is not known, and 2.
+        """
+        if self.bound != "betting":
+            return 2
+        level = self._level(tests)
+        nothing = {key: np.zeros(1) for key in self.limits}
+        return max((one.fewest(level) for one in self.statements(nothing)), default=1)
+
     def may_end(self, costs: Costs, tests: int, most: int) -> bool:
         """Whether a test of up to ``most`` episodes may end early.
 
@@ -205,7 +188,8 @@ class Verdict:
         bounds: Of the certified policy, or else of the one that missed its limits least: name ->
             (bound, limit).
         shortfalls: Of the same policy, if none is certified.
-        means: Of the same policy: name -> mean over the episodes of its test.
+        by_construction: Of the same policy: names of means that no episode can raise above its
+            limit.
         highest: Cost key -> the highest possible cost of an episode, where it is known.
         episodes: Episodes of its test.
     """
@@ -214,7 +198,7 @@ class Verdict:
     tested: list[int]
     bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
     shortfalls: dict[str, float] = field(default_factory=dict)
-    means: dict[str, float] = field(default_factory=dict)
+    by_construction: list[str] = field(default_factory=list)
     highest: dict[str, float] = field(default_factory=dict)
     episodes: int = 0
 
@@ -314,7 +298,7 @@ def _test(
         tested=[],
         bounds=bounds,
         shortfalls=missing,
-        means={one.name: float(one.values.mean()) if number else math.nan for one in statements},
+        by_construction=[one.name for one in statements if one.is_by_construction],
         highest=dict(claim.highest),
         episodes=number,
     )

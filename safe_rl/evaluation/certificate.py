@@ -1,0 +1,107 @@
+"""The result of certifying a run, and how it is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from safe_rl.evaluation.settings import CertificateOptions
+from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.scores.bounds import rounded_up
+from safe_rl.scores.certificate import Verdict
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """The result of certifying a run.
+
+    Attributes:
+        checkpoint: The policy that is certified, or None.
+        episode_return: Its mean return in further episodes.
+        verdict: Bounds, tests and shortfalls.
+        options: Options of the test.
+        means: Name -> mean in further episodes, of which none has decided when the test ended.
+        further: Number of these episodes.
+        test: Number of this test of the run; the level holds for all of them together.
+        fewest: Number of episodes below which no test with these options can succeed.
+    """
+
+    checkpoint: Path | None
+    episode_return: float
+    verdict: Verdict
+    options: CertificateOptions
+    means: Mapping[str, float] = field(default_factory=dict)
+    further: int = 0
+    test: int = 1
+    fewest: float = 1
+
+    def __str__(self) -> str:
+        """What is certified, and what the bounds do not cover: a line for every bound."""
+        verdict = self.verdict
+        level = f"at {100 * self.options.level:.12g}%"
+        actions = f"with {'mean' if self.options.deterministic else 'sampled'} actions"
+        episodes = f"{verdict.episodes:,} new episodes"
+        if self.test > 1:
+            episodes += f", test {self.test} of this run; the level is that of all its tests"
+        if self.checkpoint is None:
+            missing = "; ".join(self._on(name) for name in verdict.shortfalls)
+            line = (
+                f"Not certified {level} {actions}: no checkpoint's bound is within its limit "
+                f"({missing}; {episodes})."
+            )
+            return line + self._on_fewest()
+        if set(verdict.by_construction) == set(verdict.bounds):
+            head = f"Kept by construction {actions}: no episode can cost more"
+        elif len(verdict.bounds) > 1:
+            head = f"Certified {level} {actions}, all bounds together"
+        else:
+            head = f"Certified {level} {actions}"
+        said = [self._on(name) for name in verdict.bounds]
+        after = f"{checkpoint_steps(self.checkpoint):,} steps, return {self.episode_return:.2f}"
+        if len(said) == 1:
+            found = next(iter(self.means.values()), math.nan)
+            mean = f", mean {found:.3g} in {self.further} further episodes, at {after}"
+            return f"{head}: {said[0]} ({episodes}){mean}. {self._on_rare_episodes()}"
+        rows = [
+            f"  {line}, mean {self.means.get(name, math.nan):.3g}"
+            for name, line in zip(verdict.bounds, said, strict=True)
+        ]
+        head += f" ({episodes}; means of {self.further} further episodes; at {after}):"
+        return "\n".join([head, *rows, self._on_rare_episodes()])
+
+    def _on(self, name: str) -> str:
+        """Text on one bound."""
+        bound, limit = self.verdict.bounds[name]
+        if name in self.verdict.by_construction:
+            return f"{name} ≤ {rounded_up(bound):.3g} by construction, limit {limit:g}"
+        return f"{name} ≤ {rounded_up(bound):.3g}, limit {limit:g}"
+
+    def _on_fewest(self) -> str:
+        """Text on the number of episodes, if the test had too few to succeed."""
+        if self.fewest <= self.options.episodes:
+            return ""
+        if math.isinf(self.fewest):
+            return " No number of episodes can show this: the limit leaves no room below it."
+        return (
+            f" So few episodes never suffice: at least {self.fewest:,.0f} are needed, even if none "
+            f"costs anything, and several times that as a rule (certificate.episodes=…)."
+        )
+
+    def _on_rare_episodes(self) -> str:
+        """Text on what the bounds do not cover."""
+        said = []
+        capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
+        for name in capped:
+            cap, _, key = name.removeprefix("beyond_").partition("_")
+            said.append(
+                f"The mean of {key} is that of costs up to {cap}; {name} is the share of episodes "
+                "that cost more."
+            )
+        if self.options.bound == "student":
+            said.append("The bound assumes that no rare episodes cost far more than those tested.")
+        if not said:
+            most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
+            said.append(f"The bound includes rare episodes that cost up to {most}.")
+        return " ".join([*said, "Not covered: single episodes, other environments."])
