@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from safe_rl.cli.grammar import CommandLineError, run_command
+from safe_rl.cli.options import OptionError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
 
@@ -45,7 +45,7 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
     read = {name: getattr(options, name) for name in names}
     for name, value in vars(EvaluationOptions(**read)).items():
         if getattr(options, name) != value:
-            raise CommandLineError(
+            raise OptionError(
                 f"{name}: it is ignored by certify=true. A certificate is about the run's own "
                 "environment. Its options are certificate.episodes=… and so on, "
                 "deterministic=true and num_threads=…"

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from safe_rl.cli.grammar import CommandLineError, run_command
+from safe_rl.cli.options import OptionError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import option
 
@@ -24,7 +24,9 @@ class ExportOptions:
     checkpoint: str = option(
         "", "last, best, certified, or a path; certified if there is one, else last"
     )
-    actions: str = option("", "of FILE.onnx: mean or sampled; as they are certified, else mean")
+    actions: Literal["", "mean", "sampled"] = option(
+        "", "of FILE.onnx: mean or sampled; as they are certified, else mean"
+    )
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
@@ -40,13 +42,11 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     from safe_rl.evaluation.policies import describe, export_onnx, find_run, pack_policy
 
     import_modules(modules)
-    if options.actions not in ("", "mean", "sampled"):
-        raise CommandLineError(f"actions={options.actions}: they are mean or sampled.")
     run, target = Run(find_run(words[0])), Path(words[1])
     has_certified = run.newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
     if target.suffix not in ("", ".onnx"):
-        raise CommandLineError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
+        raise OptionError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
         check_imports(run.config, modules, run.directory)
         checkpoint = run.find_checkpoint(which)

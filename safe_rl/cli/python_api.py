@@ -19,7 +19,8 @@ from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
 from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
-from safe_rl.cli.grammar import CommandLineError, overrides_of, take_options
+from safe_rl.cli.grammar import CommandLineError, overrides_of
+from safe_rl.cli.options import make_options
 from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import GIVEN_WHOLE
 from safe_rl.cli.session import Session
@@ -196,7 +197,7 @@ def report(directory: str | Path, **options: Any) -> Path:
     Returns:
         Path of the page.
     """
-    given = take_options(options, report_command.ReportOptions)
+    given = make_options(options, report_command.ReportOptions)
     return report_command.report(Path(directory).expanduser(), given)[1]
 
 
@@ -292,7 +293,7 @@ class Run(RecordedRun):
             ValueError: If there is no such option, or it cannot have the value.
         """
         given = {"checkpoint": self.checkpoint, **options}
-        return evaluate_run(self.directory, take_options(given, EvaluationOptions))
+        return evaluate_run(self.directory, make_options(given, EvaluationOptions))
 
     def certify(self, **changes: Any) -> Certificate | None:
         """Certify the best checkpoint that keeps the limits, as at the end of training.
@@ -317,4 +318,4 @@ class Run(RecordedRun):
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
         """
         given = {"checkpoint": self.checkpoint, "variations": variations, **options}
-        return evaluate_varied(self.directory, take_options(given, EvaluationOptions))[0]
+        return evaluate_varied(self.directory, make_options(given, EvaluationOptions))[0]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from safe_rl.cli.grammar import run_command
+from safe_rl.cli.options import run_command
 from safe_rl.cli.user_code import import_modules
 from safe_rl.envs.families import config_node
 from safe_rl.envs.safety_gym.suite import SUITE, resolve

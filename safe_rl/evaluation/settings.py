@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_type_hints
 
 from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from safe_rl.checks import Fraction, Share
-from safe_rl.parameters import parameters_of
+from safe_rl.checks import Fraction, Share, check_value, rule
 from safe_rl.ranges import Values
 
 PICTURES = ("gif", "webp")
@@ -28,14 +27,12 @@ def _is_device(value: Any) -> bool:
     return (device.index or 0) < here.get(device.type, 0)
 
 
-Device = Annotated[
-    str, Values(_is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
-]
-_PICTURE = Values(
-    lambda v: v is not None and Path(v).suffix[1:] in PICTURES,
-    f"a file ending in .{' or .'.join(PICTURES)}",
+_WHERE = "cpu; or cuda or cuda:<number>, if torch finds this GPU here"
+Device = Annotated[str, rule(_is_device, _WHERE), Values(_is_device, _WHERE)]
+_PICTURE = rule(
+    lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )
-_NAME = Values(lambda v: "/" not in v and v.isprintable(), "a part of files' names, without /")
+_NAME = rule(lambda v: "/" not in v and v.isprintable(), "a part of files' names, without /")
 
 
 def option(default: Any, help: str) -> Any:
@@ -46,7 +43,7 @@ def option(default: Any, help: str) -> Any:
 
 @dataclass
 class EvaluationOptions:
-    """Options of ``python -m safe_rl.evaluate``; the help texts say what they mean."""
+    """Options of ``safe-rl evaluate``; the help texts say what they mean."""
 
     episodes: Annotated[int, Interval(ge=1, le=10**8)] = option(100, "whole episodes to run")
     checkpoint: str = option(
@@ -124,8 +121,8 @@ def check_options(options: EvaluationOptions) -> None:
     Raises:
         ValueError: If an option is out of its range, or needs another one; the message names it.
     """
-    for name, parameter in parameters_of(EvaluationOptions).items():
-        parameter.check(name, getattr(options, name))
+    for name, kind in get_type_hints(EvaluationOptions, include_extras=True).items():
+        check_value(name, kind, getattr(options, name))
     if options.certificate and not options.certify:
         raise ValueError("certificate.…: it is the certificate's: add certify=true.")
     films = options.video or options.picture

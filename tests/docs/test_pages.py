@@ -17,7 +17,7 @@ from registrations import undone
 from safe_rl import trust
 from safe_rl.cli import user_code
 from safe_rl.cli.export import ExportOptions
-from safe_rl.cli.grammar import parse_options, split_imports
+from safe_rl.cli.options import read_options
 from safe_rl.cli.report import ReportOptions
 from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
@@ -105,8 +105,8 @@ def check(words: list[str], run: Path) -> None:
         module, _, *options = arguments
         schema, *others = SCHEMAS[module]
         options = options[len(others) :]
-        _, options = split_imports([o for o in options if o != "--help"])
-        parsed = parse_options(options, schema)
+        words = [o for o in options if o != "--help" and not o.startswith("import=")]
+        parsed = read_options(words, schema)
         if isinstance(parsed, EvaluationOptions):
             check_options(parsed)
             if parsed.variations is not None and "my_" not in str(parsed.variations):

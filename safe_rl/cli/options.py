@@ -1,0 +1,170 @@
+"""Options of the commands ``evaluate``, ``export`` and ``report``, and how these commands run.
+
+Options are written ``key=value`` in Hydra's grammar, as in training. They are the fields of a
+dataclass: pydantic checks them by their annotations, and their help texts make the command's help.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from safe_rl.checks import check_value
+from safe_rl.naming import did_you_mean
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Options = TypeVar("Options", bound="DataclassInstance")
+
+
+class OptionError(ValueError):
+    """Words of a command that cannot be used; the message says what to write instead."""
+
+
+def read_options(words: Iterable[str], schema: type[Options]) -> Options:
+    """Read options from words ``key=value``; nested keys have dots.
+
+    Raises:
+        OptionError: If a word is no option of the dataclass (the message names the nearest one).
+        SettingError: If an option has a value that its annotation does not allow.
+
+    Examples:
+        >>> from safe_rl.evaluation import EvaluationOptions
+        >>> read_options(["episodes=1_000", "env.hazards_num=3"], EvaluationOptions).env
+        {'hazards_num': 3}
+    """
+    kinds = get_type_hints(schema, include_extras=True)
+    given: list[tuple[str, Any]] = []
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals:
+            raise OptionError(f"'{word}' is not an option: they are written key=value.")
+        # texts are taken literally: the grammar would change `off` and `007`, and refuse `it's`
+        is_text = _is_text(kinds.get(key)) and text[:1] not in ("'", '"') and text != "null"
+        given.append((key, text if is_text else _value(word)))
+    return make_options(given, schema)
+
+
+def make_options(
+    given: Mapping[str, Any] | Iterable[tuple[str, Any]], schema: type[Options]
+) -> Options:
+    """Make options of keys, which may have dots, and values; errors as of `read_options`."""
+    kinds = get_type_hints(schema, include_extras=True)
+    read = OmegaConf.create()
+    for key, value in given.items() if isinstance(given, Mapping) else given:
+        name = key.partition(".")[0]
+        if name not in kinds:
+            raise OptionError(
+                f"Unknown option '{name}'.{did_you_mean(name, kinds)} "
+                f"Options are: {', '.join(kinds)}."
+            )
+        OmegaConf.update(read, key, _plain(value), force_add=True)
+    found = OmegaConf.to_container(read)
+    assert isinstance(found, dict)
+    return schema(**{str(k): check_value(str(k), kinds[str(k)], v) for k, v in found.items()})
+
+
+def _is_text(kind: Any) -> bool:
+    """Whether an annotation is that of a text, or of a text or null."""
+    if get_origin(kind) is Literal:
+        return isinstance(get_args(kind)[0], str)
+    inner = get_args(kind) if get_origin(kind) in (Annotated, Union, UnionType) else ()
+    return kind is str or any(map(_is_text, inner))
+
+
+def _value(word: str) -> Any:
+    try:
+        return OverridesParser.create().parse_override(word).value()
+    except HydraException as error:
+        hint = " Put values with spaces in quotes: cost_limits='{cost: 10}'." if "{" in word else ""
+        raise OptionError(f"'{word}' cannot be read: {str(error).splitlines()[0]}.{hint}") from None
+
+
+def _plain(value: Any) -> Any:
+    """A value with plain containers and numbers, as a command line has them."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy or torch
+    return str(value) if isinstance(value, Path) else value
+
+
+def usage(command: str, schema: type[DataclassInstance]) -> str:
+    """The help of a command: how it is called, its options, their defaults and meanings."""
+    lines = [f"usage: {command} [option=value ...]", ""]
+    for field in fields(schema):
+        default = "null" if field.default is None else str(field.default).lower()
+        shown = f"{field.name}.…" if field.default is MISSING else f"{field.name}={default}"
+        lines.append(f"  {shown:<24} {field.metadata['help']}")
+    lines.append(f"  {'import=…':<24} a module or file of yours to import before; may be repeated")
+    return "\n".join(lines)
+
+
+def run_command(
+    work: Callable[[list[str], Any, list[str] | None], int],
+    arguments: Sequence[str] | None,
+    command: str,
+    schema: type[DataclassInstance],
+) -> int:
+    """Read the arguments of a command, and run it or print its help; return its exit status.
+
+    An error is printed as one line; ``HYDRA_FULL_ERROR=1`` shows the traceback instead. After
+    Ctrl-C the process ends by that signal, so that a shell's loop over commands ends as well.
+
+    Args:
+        work: Function of the positional arguments, the options, and the modules of ``import=`` or
+            None; it returns the exit status.
+        arguments: The arguments; None: those of the process.
+        command: The program, followed by its positional arguments in capitals.
+        schema: Dataclass of its options.
+    """
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    places = sum(word[0].isupper() for word in command.split())
+    is_help = words[:1] in (["-h"], ["--help"])
+    imports = [word for word in words if word.startswith("import=")]
+    words = [word for word in words if word not in imports]
+    if is_help or len(words) < places:
+        print(usage(command, schema))
+        return 0 if is_help else 2
+    try:
+        modules = [module for word in imports for module in _modules(word)] if imports else None
+        return work(words[:places], read_options(words[places:], schema), modules)
+    except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
+        if os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+        raise
+
+
+def _modules(word: str) -> list[str]:
+    """The modules of ``import=my_module`` or ``import=[first,second]``."""
+    text = word.partition("=")[2]
+    return list(_value(word)) if text.startswith("[") else [text]
