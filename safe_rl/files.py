@@ -33,6 +33,16 @@ _MOST_LEVELS = 100
 _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
+def printable(text: str) -> str:
+    r"""A text of unknown origin for the terminal, which control characters could change.
+
+    Examples:
+        >>> printable("red\x1b[31m")
+        'red?[31m'
+    """
+    return _CONTROLS.sub("?", text)
+
+
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Reads YAML in a tenth of OmegaConf's time, and 1e-4 as a number, as OmegaConf does.
 

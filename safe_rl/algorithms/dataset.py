@@ -5,18 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from re import search
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.off_policy_networks import bounded_actions
 from safe_rl.algorithms.replay_buffer import Memory
-from safe_rl.collectors import read_action_bounds, read_dataset, safe_episodes
+from safe_rl.collectors import (
+    match_columns,
+    read_columns,
+    read_dataset,
+    safe_episodes,
+    safety_gymnasium_columns,
+)
 from safe_rl.files import read_config
 
 _ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
@@ -56,7 +64,11 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
         )
         return warning if frames < needed else "", True
     limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    learns_from = _fill(buffer, node, limits, env, bounded_actions(env))
+    steps, interface = read_dataset(node.path), read_columns(node.path)
+    try:
+        learns_from = _fill(buffer, steps, interface, node, limits, env)
+    except ValueError as error:
+        raise ValueError(f"dataset.path={node.path}: {error}") from error
     return learns_from + _other_environment(config), not node.alone
 
 
@@ -71,35 +83,74 @@ def _other_environment(config: DictConfig) -> str:
 
 
 def _fill(
-    buffer: Memory, node: DictConfig, limits: Mapping[str, float], env: EnvBase, actions: TensorSpec
+    buffer: Memory,
+    steps: TensorDictBase,
+    interface: Mapping[str, Any],
+    node: DictConfig,
+    limits: Mapping[str, float],
+    env: EnvBase,
 ) -> str:
     """Put the transitions of a dataset into a replay buffer; return a sentence on them."""
-    steps = read_dataset(node.path)
-    _check(steps, node, buffer, env, actions)
+    actions = bounded_actions(env)
+    _check_entries(steps, buffer, env, actions)
+    warning = _arrange(steps, interface, node, env)
     number = steps.batch_size.numel()
     if node.safe_episodes:
         if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
-            raise ValueError(
-                f"dataset.path={node.path} has no {', '.join(missing)}, which cost_limits names."
-            )
-        _check_finite(steps, node, [("next", key) for key in limits])
+            raise ValueError(f"it has no {', '.join(missing)}, which cost_limits names.")
+        _check_finite(steps, [("next", key) for key in limits])
         steps = safe_episodes(steps, limits)
     taken = steps.batch_size.numel()
     if not 0 < taken <= buffer.capacity:
         what = " in whole episodes that keep cost_limits" if node.safe_episodes else ""
         raise ValueError(
-            f"dataset.path={node.path}: of its {number:,} transitions {taken:,} are taken"
-            f"{what}. There must be some, and room for them: memory.capacity={buffer.capacity}."
+            f"of its {number:,} transitions {taken:,} are taken{what}. There must be some, and "
+            f"room for them: memory.capacity={buffer.capacity}."
         )
-    _check_finite(steps, node, buffer.in_keys)
-    steps["action"] = _as_chosen(steps["action"], node.path, env, actions)
+    _check_finite(steps, buffer.in_keys)
+    is_recorded = Path(node.path).is_dir()
+    steps["action"] = _as_chosen(steps["action"], interface, is_recorded, env, actions)
     buffer.extend(steps)
     buffer.end_rows()
     kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
-    return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}."
+    return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}.{warning}"
 
 
-def _as_chosen(action: Tensor, path: str, env: EnvBase, spec: TensorSpec) -> Tensor:
+def _arrange(
+    steps: TensorDictBase, interface: Mapping[str, Any], node: DictConfig, env: EnvBase
+) -> str:
+    """Put the columns of observations into the environment's order; return a warning, or ""."""
+    columns, own = interface.get("columns"), env.column_names
+    if columns is None and node.get("columns") == "safety_gymnasium":
+        columns = safety_gymnasium_columns(own)
+    if columns is not None:
+        sensors = interface.get("sensors"), env.sensor_keys
+        order = match_columns(columns, own, *sensors)
+        if order != [*range(len(own))]:
+            for key in ("observation", ("next", "observation")):
+                steps[key] = steps[key][..., order]
+        return ""
+    if match := search(r"(?:Safety|Offline)\w+Gymnasium-v\d", Path(node.path).name):
+        raise ValueError(
+            f"it is of {match[0]}, whose columns have another order: dataset.columns="
+            "safety_gymnasium."
+        )
+    spec, seen = env.observation_spec["observation"], steps["observation"].flatten(0, -2)
+    if isinstance(spec, Bounded):
+        beyond = (seen < spec.low[0].cpu() - 1e-3) | (seen > spec.high[0].cpu() + 1e-3)
+        if number := int(beyond.any(0).sum()):
+            raise ValueError(
+                f"{number} of the {len(own)} columns of its observations leave the bounds of this "
+                "environment's: their order is another one. Files of Safety-Gymnasium and DSRL "
+                "need dataset.columns=safety_gymnasium; others can name their columns in the "
+                f"attribute observation_columns: {own[0]}, …"
+            )
+    return " Warning: it does not name the columns of its observations, which are used as they are."
+
+
+def _as_chosen(
+    action: Tensor, interface: Mapping[str, Any], is_recorded: bool, env: EnvBase, spec: TensorSpec
+) -> Tensor:
     """Actions [N, T, A] of a dataset in the units in which policies choose them.
 
     HDF5 files have the environment's own units. A recording has those of its policy, which may
@@ -108,16 +159,31 @@ def _as_chosen(action: Tensor, path: str, env: EnvBase, spec: TensorSpec) -> Ten
     Raises:
         ValueError: If actions of a file, or of another environment, are outside the bounds.
     """
-    chosen = [spec.low.cpu(), spec.high.cpu()]
-    own = [bound.flatten() for bound in env.action_bounds]
-    if Path(path).is_dir():
-        recorded = read_action_bounds(path) or [*chosen, *own]
+    chosen, own = (
+        [spec.low.cpu(), spec.high.cpu()],
+        [bound.flatten() for bound in env.action_bounds],
+    )
+    if is_recorded:
+        recorded = _recorded_bounds(interface, chosen + own)
         action = action.clamp(*recorded[:2])
-        if all(map(torch.equal, recorded, [*chosen, *own])):
+        if all(map(torch.equal, recorded, chosen + own)):
             return action
         action = _rescaled(action, recorded[:2], recorded[2:])
-    _check_bounds(action, path, *own)
+    _check_bounds(action, *own)
     return _rescaled(action, own, chosen).clamp(*chosen)
+
+
+def _recorded_bounds(interface: Mapping[str, Any], otherwise: list[Tensor]) -> list[Tensor]:
+    if interface.get("actions") is None:
+        return otherwise
+    try:
+        names = ("low", "high", "own_low", "own_high")
+        bounds = [torch.tensor(interface["actions"][name]).float() for name in names]
+        if any(bound.shape != otherwise[0].shape for bound in bounds):
+            raise ValueError("there must be one per column")
+        return bounds
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the bounds of its actions cannot be read: {error}") from error
 
 
 def _rescaled(action: Tensor, old: list[Tensor], new: list[Tensor]) -> Tensor:
@@ -128,7 +194,7 @@ def _rescaled(action: Tensor, old: list[Tensor], new: list[Tensor]) -> Tensor:
     return new[0] + share * (new[1] - new[0])
 
 
-def _check_bounds(action: Tensor, path: str, low: Tensor, high: Tensor) -> None:
+def _check_bounds(action: Tensor, low: Tensor, high: Tensor) -> None:
     """Refuse actions [N, T, A] outside the bounds [A] by more than a rounding error."""
     action, width = action.flatten(0, 1), _ROUNDING * (high - low)
     beyond = (action < low - width) | (action > high + width)
@@ -137,21 +203,19 @@ def _check_bounds(action: Tensor, path: str, low: Tensor, high: Tensor) -> None:
     column = int(beyond.sum(0).argmax())
     values = action[:, column]
     raise ValueError(
-        f"dataset.path={path}: {beyond.any(-1).float().mean():.1%} of its actions are outside the "
-        f"bounds of this environment. Those of column {column} are from {values.min():g} to "
-        f"{values.max():g}, and the bounds are {low[column]:g} and {high[column]:g}. Actions of a "
-        "dataset are in the environment's own units: rescale them, or remove these episodes."
+        f"{beyond.any(-1).float().mean():.1%} of its actions are outside the bounds of this "
+        f"environment. Those of column {column} are from {values.min():g} to {values.max():g}, and "
+        f"the bounds are {low[column]:g} and {high[column]:g}. Actions of a dataset are in the "
+        "environment's own units: rescale them, or remove these episodes."
     )
 
 
-def _check(
-    steps: TensorDictBase, node: DictConfig, buffer: Memory, env: EnvBase, actions: TensorSpec
+def _check_entries(
+    steps: TensorDictBase, buffer: Memory, env: EnvBase, actions: TensorSpec
 ) -> None:
     """Refuse transitions of another environment, or without an entry that the loss reads."""
     if missing := [_name(key) for key in buffer.in_keys if key not in steps.keys(True)]:
-        raise ValueError(
-            f"dataset.path={node.path} has no {', '.join(missing)}, which is learned from."
-        )
+        raise ValueError(f"it has no {', '.join(missing)}, which is learned from.")
     sizes = {
         "observation": env.observation_spec["observation"].shape[-1],
         "action": actions.shape[-1],
@@ -159,18 +223,18 @@ def _check(
     for key, size in sizes.items():
         if steps[key].shape[-1] != size:
             raise ValueError(
-                f"dataset.path={node.path}: its {key}s are {steps[key].shape[-1]} numbers, those "
-                f"of this environment {size}. It is a dataset of another one."
+                f"its {key}s are {steps[key].shape[-1]} numbers, those of this environment {size}. "
+                "It is a dataset of another one."
             )
 
 
-def _check_finite(steps: TensorDictBase, node: DictConfig, keys: Sequence[NestedKey]) -> None:
+def _check_finite(steps: TensorDictBase, keys: Sequence[NestedKey]) -> None:
     """Refuse NaN and infinity, which would look like diverged training, or like a cost of 0."""
     for key in keys:
         if wrong := int((~steps[key].isfinite()).any(-1).sum()):
             raise ValueError(
-                f"dataset.path={node.path}: the {_name(key)} of {wrong:,} transitions is not "
-                "finite. Remove their episodes, or repair the file."
+                f"the {_name(key)} of {wrong:,} transitions is not finite. Remove their episodes, "
+                "or repair the file."
             )
 
 

@@ -100,6 +100,10 @@ _ROWS: dict[str, tuple[Any, str]] = {
     "critics.costs": (_Few, "number of Q functions of the costs"),
     "dataset": (Options, "recorded transitions that the replay buffer begins with"),
     "dataset.path": (Text | None, "folder of a recording, or an HDF5 file"),
+    "dataset.columns": (
+        Literal["safety_gymnasium"] | None,
+        "order of observed columns in a file that does not name them; null: the environment's",
+    ),
     "dataset.safe_episodes": (bool, "whether only episodes within cost_limits are taken"),
     "dataset.alone": (bool, "whether to learn from the dataset only"),
     "exploration": (Options, "exploration of off-policy algorithms"),

@@ -199,7 +199,7 @@ class Session:
         if self._continues and folder.num_rows:
             print("No checkpoint was written yet: starting over, with a new progress.csv.")
         if config.init_from is not None:
-            begin_from(trainer.algorithm, config)
+            begin_from(trainer.algorithm, config, trainer.interface)
         if not (self._continues and folder.robot_file.exists()):
             keep_robot(folder, plain(config)["env"])
         return trainer

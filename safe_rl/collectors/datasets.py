@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from re import fullmatch
+from re import fullmatch, sub
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
-from safe_rl.collectors.recording import PARTIAL, read_recording
+from safe_rl.collectors.recording import PARTIAL, read_interface, read_recording
 from safe_rl.extras import import_extra
 
 Arrays = dict[NestedKey, np.ndarray]
@@ -47,6 +48,51 @@ def read_dataset(path: Path | str) -> TensorDictBase:
     if not Path(path).exists():
         raise FileNotFoundError(f"{path}: there is no such recording, and no such file.")
     return read_recording(path) if Path(path).is_dir() else read_hdf5(path)
+
+
+def read_columns(path: Path | str) -> dict[str, Any]:
+    """What a dataset says of its columns and units: as ``interface`` of an environment, or less.
+
+    An HDF5 file names the columns of its observations in the attribute ``observation_columns``,
+    an array of texts at its root.
+
+    Raises:
+        ValueError: If it cannot be read.
+        ModuleNotFoundError: If it is a file, and h5py is not installed.
+    """
+    if Path(path).is_dir():
+        return read_interface(path)
+    with open_hdf5(path) as file:
+        names = file.attrs.get("observation_columns")
+        return {} if names is None else {"columns": [str(name) for name in np.ravel(names)]}
+
+
+# The order of Safety-Gymnasium 1.0, also in files of DSRL: the robot's sensors, velocities of
+# joints before positions, then lidars of geoms, of free bodies and of moving ones; # is a number.
+_SAFETY_GYMNASIUM = (
+    *("accelerometer", "velocimeter", "gyro", "magnetometer", "touch_ankle_#a", "touch_ankle_#b"),
+    *("jointvel_hip_#_z", "jointvel_hip_#_y", "jointvel_ankle_#", "ballangvel_rear"),
+    *("jointpos_hip_#_z", "jointpos_hip_#_y", "jointpos_ankle_#", "ballquat_rear"),
+    *("buttons_lidar", "goal_lidar", "circle_lidar", "hazards_lidar", "pillars_lidar"),
+    *("vases_lidar", "box_lidar", "gremlins_lidar", "qpos", "qvel"),
+)
+
+
+def safety_gymnasium_columns(columns: Sequence[str]) -> list[str]:
+    """Names of an environment's columns in the order of Safety-Gymnasium and DSRL.
+
+    Raises:
+        ValueError: If the environment observes what their tasks do not.
+
+    Examples:
+        >>> safety_gymnasium_columns(["goal_lidar[0]", "goal_lidar[1]", "velocimeter[0]"])
+        ['velocimeter[0]', 'goal_lidar[0]', 'goal_lidar[1]']
+    """
+    kinds = [sub(r"\d", "#", name.partition("[")[0]) for name in columns]
+    if unknown := set(kinds) - set(_SAFETY_GYMNASIUM):
+        raise ValueError(f"Safety-Gymnasium does not observe {', '.join(sorted(unknown))}.")
+    order = sorted(range(len(columns)), key=lambda at: (_SAFETY_GYMNASIUM.index(kinds[at]), at))
+    return [columns[at] for at in order]
 
 
 def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorDictBase:
@@ -98,16 +144,10 @@ def read_hdf5(path: Path | str) -> TensorDict:
             have one row of numbers for each action.
         ModuleNotFoundError: If h5py is not installed.
     """
-    h5py = import_extra("h5py", "hdf5")
-    if not h5py.is_hdf5(path):
-        raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
-    try:
-        with h5py.File(path, "r") as file:
-            episodes = (name for name in file if fullmatch(r"episode_\d+", name))
-            names = sorted(episodes, key=lambda name: int(name[8:]))
-            arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
+    with open_hdf5(path) as file:
+        episodes = (name for name in file if fullmatch(r"episode_\d+", name))
+        names = sorted(episodes, key=lambda name: int(name[8:]))
+        arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
     number = len(arrays["action"])
     if not number:
         raise ValueError(f"{path} holds no transitions.")
@@ -117,6 +157,19 @@ def read_hdf5(path: Path | str) -> TensorDict:
         steps[key] = column if key in _FLAGS else column.float()
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     return steps
+
+
+@contextmanager
+def open_hdf5(path: Path | str) -> Iterator[Any]:
+    """Open an HDF5 file of unknown origin; errors of reading are ValueErrors."""
+    h5py = import_extra("h5py", "hdf5")
+    if not h5py.is_hdf5(path):
+        raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
 
 
 def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:

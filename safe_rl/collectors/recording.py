@@ -9,47 +9,76 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
-from safe_rl.files import check_no_links, load_tensors, read_json, replace_json, save_tensors
+from safe_rl.files import (
+    check_no_links,
+    load_tensors,
+    printable,
+    read_json,
+    replace_json,
+    save_tensors,
+)
 
-ABOUT = "recording.json"
-"""File of a recording with what :func:`describe_env` says of its environment."""
+INTERFACE = "recording.json"
+"""File of a recording with the ``interface`` of its environment: columns, units of actions."""
 PARTIAL = "partial"
 """Entry [N, T, 1] bool, true in at least one step of an episode that is not recorded completely."""
 
-BOUNDS = ("low", "high", "own_low", "own_high")
 # other entries, such as those that a policy writes, are not recorded
 _FLAGS = ("done", "terminated", "truncated")
 
 
-def describe_env(env: EnvBase) -> dict[str, Any]:
-    """What is recorded beside the steps of an environment: the units of its actions.
-
-    ``actions`` has the bounds of recorded actions, ``low`` and ``high``, and those that the
-    environment has in its own units, ``own_low`` and ``own_high``; it is None for choices.
-    """
-    if env.action_bounds is None:
-        return {"actions": None}
-    spec = env.action_spec_unbatched
-    bounds = dict(zip(BOUNDS, (spec.low, spec.high, *env.action_bounds), strict=True))
-    return {"actions": {name: bound.flatten().tolist() for name, bound in bounds.items()}}
-
-
-def read_action_bounds(folder: Path | str) -> list[Tensor] | None:
-    """Bounds of a recording's actions as :func:`describe_env` lists them, [A] each; None: unknown.
+def read_interface(folder: Path | str) -> dict[str, Any]:
+    """The ``interface`` of the environment that was recorded; empty if the folder has none.
 
     Raises:
         ValueError: If the file cannot be read.
     """
-    path = Path(folder) / ABOUT
-    if not path.exists():
-        return None
-    try:
-        actions = read_json(path)["actions"]
-        return actions and list(torch.tensor([actions[name] for name in BOUNDS]).float())
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} does not describe a recording: {error}") from error
+    path = Path(folder) / INTERFACE
+    interface = read_json(path) if path.exists() else {}
+    if not isinstance(interface, dict):
+        raise ValueError(f"{path} does not describe a recording.")
+    return interface
+
+
+def match_columns(
+    columns: Any, own: Sequence[str], sensors: Any = None, own_sensors: Mapping[str, Any] = {}
+) -> list[int]:
+    """Where in other columns the columns of an environment are, by their names.
+
+    Args:
+        columns: Names of the other columns, of unknown origin.
+        own: ``column_names`` of the environment.
+        sensors: ``sensor_keys`` of the other columns; None: unknown.
+        own_sensors: ``sensor_keys`` of the environment.
+
+    Raises:
+        ValueError: If names or keys differ; the message says which.
+
+    Examples:
+        >>> match_columns(["speed", "place"], ["place", "speed"])
+        [1, 0]
+        >>> match_columns(["speed", "place"], ["place", "angle"])
+        Traceback (most recent call last):
+        ValueError: they have speed, where this environment has angle
+    """
+    if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
+        raise ValueError("their columns are not a list of names")
+    if sorted(columns) != sorted(own):
+        others, missing = (
+            ", ".join(dict.fromkeys(name.partition("[")[0] for name in names)) or "nothing"
+            for names in (
+                [name for name in columns if name not in own],
+                [name for name in own if name not in columns],
+            )
+        )
+        raise ValueError(printable(f"they have {others}, where this environment has {missing}"))
+    for key, value in own_sensors.items():
+        if isinstance(sensors, dict) and sensors.get(key, value) != value:
+            raise ValueError(
+                printable(f"their {key} is {sensors[key]}, and that of this environment {value}")
+            )
+    return [columns.index(name) for name in own]
 
 
 class Recording:
@@ -58,8 +87,8 @@ class Recording:
     Args:
         folder: Path of the folder, which is made if it does not exist.
         cost_keys: Costs below ``next`` that are recorded.
-        about: Units of the actions, :func:`describe_env` of the environment. None: they are those
-            of the environment in which the recording is used.
+        interface: Columns and units, ``interface`` of the environment. None: they are those of the
+            environment in which the recording is used.
 
     Raises:
         KeyError: When a batch is written that lacks one of the entries.
@@ -86,9 +115,9 @@ class Recording:
         self,
         folder: Path | str,
         cost_keys: Sequence[str],
-        about: Mapping[str, Any] | None = None,
+        interface: Mapping[str, Any] | None = None,
     ) -> None:
-        self.folder, self._about = Path(folder), about
+        self.folder, self._interface = Path(folder), interface
         following = ("observation", "reward", *cost_keys, *_FLAGS)
         self._keys = ["observation", "action", *(("next", key) for key in following)]
         self._cut: int | None = None  # number of the last batch after which new episodes begin
@@ -106,7 +135,7 @@ class Recording:
         for path in [*unfinished, *(p for p in _pieces(self.folder) if int(p.stem) >= number)]:
             path.unlink()
         if not number:
-            (self.folder / ABOUT).unlink(missing_ok=True)
+            (self.folder / INTERFACE).unlink(missing_ok=True)
 
     def write(self, number: int, batch: TensorDictBase, *, begun: Tensor | None = None) -> None:
         """Write a batch [N, T]; an earlier file with the same number is replaced.
@@ -146,8 +175,8 @@ class Recording:
 
     def _store(self, number: int, steps: TensorDictBase) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        if self._about is not None and not (self.folder / ABOUT).exists():
-            replace_json(self.folder / ABOUT, self._about)
+        if self._interface is not None and not (self.folder / INTERFACE).exists():
+            replace_json(self.folder / INTERFACE, self._interface)
         # of a view, torch would save the whole underlying storage
         save_tensors(self._place(number), steps.clone().to_dict())
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -40,6 +41,7 @@ class ConstrainedEnv(EnvBase):
         steps_per_decision: Environment steps that one call of `step` takes. If it is not 1, each
             call writes their number to `steps_taken` [N, 1]: it is lower where an episode ends.
         steps_before: Steps of every row in earlier parts of the run.
+        sensor_keys: Keys of the configuration on which the meaning of columns depends.
         first_steps: Numbers of steps [N] that the episodes of the next reset count as taken; None
             (the default) is 0. Only for environments whose state has `step_count`.
         render: Method that draws pictures as `SimulatedEnv.render` does; None if there is none.
@@ -56,6 +58,7 @@ class ConstrainedEnv(EnvBase):
     observation_layout: Any
     return_key: str = "reward"
     events: tuple[str, ...] = ()
+    sensor_keys: Mapping[str, Any] = MappingProxyType({})
     seconds_per_step: Any = None
     steps_per_decision: Any = 1
     steps_before: int = 0
@@ -69,6 +72,31 @@ class ConstrainedEnv(EnvBase):
         The action spec has other bounds where actions are rescaled on their way (`env=gymnasium`).
         """
         return bounds_of(self.action_spec_unbatched)
+
+    @property
+    def column_names(self) -> list[str]:
+        """Names of the columns of a flat observation: ``gyro[0]``, ``gyro[1]`` and so on."""
+        names: dict[int, str] = {}
+        for name, columns in self.observation_layout.items():
+            places = range(columns.start or 0, columns.stop)
+            single = len(places) == 1
+            names |= {at: name if single else f"{name}[{n}]" for n, at in enumerate(places)}
+        return [names.get(at, f"column[{at}]") for at in range(max(names, default=-1) + 1)]
+
+    @property
+    def interface(self) -> dict[str, Any]:
+        """What numbers mean for a policy, JSON-compatible; recordings and checkpoints keep it.
+
+        ``columns`` are `column_names`, ``sensors`` the `sensor_keys`. ``actions`` has the bounds of
+        actions as policies choose them, ``low`` and ``high``, and in the environment's own units,
+        ``own_low`` and ``own_high``; None for choices.
+        """
+        own, spec, actions = self.action_bounds, self.action_spec_unbatched, None
+        if own is not None:
+            bounds = {"low": spec.low, "high": spec.high, "own_low": own[0], "own_high": own[1]}
+            actions = {name: bound.flatten().tolist() for name, bound in bounds.items()}
+        sensors = dict(self.sensor_keys)
+        return {"columns": self.column_names, "sensors": sensors, "actions": actions}
 
     def get_state(self) -> Any:
         """Return a copy of everything that determines what happens next, a TensorDict [N].
@@ -168,7 +196,7 @@ def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[s
 _DEFAULTS = (
     *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "first_steps"),
     *("render", "get_state", "add_steps", "get_positions", "continue_from", "highest_cost"),
-    "action_bounds",
+    *("action_bounds", "sensor_keys"),
 )
 
 

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.checkpoints import CheckpointStore, check_interface
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -62,6 +62,7 @@ def load_policy(
             f"The policy in {checkpoint} was trained on other observations or actions than this "
             "environment's: undo the env.… override that changes them."
         ) from error
+    check_interface(checkpoint, env.interface)
     for network in networks.values():
         if not all(weight.isfinite().all() for weight in network.parameters()):
             raise CheckpointError(

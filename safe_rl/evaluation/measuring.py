@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.collectors import Recording, StepRecorder, describe_env
+from safe_rl.collectors import Recording, StepRecorder
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
 from safe_rl.evaluation.loading import (
     for_evaluation,
@@ -122,7 +122,7 @@ class Trial:
             policy = self.policy(env)  # before an earlier recording is removed: it may not fit
             recorder = None
             if record is not None:
-                recorder = StepRecorder(Recording(record, env.cost_keys, describe_env(env)))
+                recorder = StepRecorder(Recording(record, env.cost_keys, env.interface))
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,

@@ -191,11 +191,7 @@ def export_onnx(
 def _interface(config: DictConfig, env: EnvBase, bounds: Sequence[Tensor]) -> dict[str, Any]:
     """What a program must know to use a policy: columns, units, the environment of training."""
     return {
-        "observation": [
-            name if columns.stop - columns.start == 1 else f"{name}[{number}]"
-            for name, columns in env.observation_layout.items()
-            for number in range(columns.stop - columns.start)
-        ],
+        "observation": env.column_names,
         "action_low": bounds[0].tolist(),
         "action_high": bounds[1].tolist(),
         "steps_per_action": env.steps_per_decision,

@@ -16,6 +16,7 @@ from typing import Any
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
+from safe_rl.collectors import match_columns
 from safe_rl.files import load_tensors, save_tensors
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
@@ -56,6 +57,32 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
     return content
 
 
+def check_interface(path: Path, interface: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint whose policy was trained on other observations of the same size.
+
+    Args:
+        path: The checkpoint. If it says nothing of its observations, it is not checked.
+        interface: ``interface`` of the environment in which the policy is to act.
+
+    Raises:
+        CheckpointError: If names of columns or kinds of sensors differ; the message says which.
+    """
+    known = read_facts(path).get("interface")
+    if not isinstance(known, dict):
+        return
+    own, sensors = interface["columns"], interface["sensors"]
+    try:
+        if match_columns(known.get("columns"), own, known.get("sensors"), sensors) != [
+            *range(len(own))
+        ]:
+            raise ValueError("their order is another one")
+    except ValueError as error:
+        raise CheckpointError(
+            f"The policy in {path} was trained on other observations than this environment's: "
+            f"{error}. Undo the env.… override that changes them."
+        ) from error
+
+
 def best_checkpoint(directory: Path) -> Path | None:
     """The checkpoint with the highest score in a folder, the newest among equal ones.
 
@@ -86,6 +113,7 @@ class CheckpointStore:
         keep_best: Number of best checkpoints to keep.
         run: JSON-compatible facts of the run that every checkpoint holds. A checkpoint with other
             facts is refused when the run is resumed.
+        interface: ``interface`` of the environment, which every checkpoint holds as well.
     """
 
     def __init__(
@@ -96,7 +124,9 @@ class CheckpointStore:
         keep_last: int,
         keep_best: int = 1,
         run: Mapping[str, Any] | None = None,
+        interface: Mapping[str, Any] | None = None,
     ) -> None:
+        self._interface = interface
         self.last = Path(directory) / "last"
         self.best = Path(directory) / "best"
         self._components = dict(components)
@@ -177,7 +207,8 @@ class CheckpointStore:
     ) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / checkpoint_name(steps)
-        facts = {**(facts or {}), **({"run": self._run} if self._run else {})}
+        held = {"run": self._run, "interface": self._interface}
+        facts = {**(facts or {}), **{name: value for name, value in held.items() if value}}
         save_tensors(path, {"facts": facts, "parts": dict(states)})
         return path
 

@@ -21,9 +21,9 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.collectors import Recording, WorkerCollector, describe_env, make_collector
+from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv
-from safe_rl.runs.checkpoints import read_states
+from safe_rl.runs.checkpoints import check_interface, read_states
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
@@ -74,7 +74,7 @@ def build_trainer(
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
     writer = RunWriter(Run(directory), config, cost_limits, env.max_episode_steps)
-    recording = Recording(writer.run.transitions_folder, env.cost_keys, describe_env(env))
+    recording = Recording(writer.run.transitions_folder, env.cost_keys, env.interface)
     return Trainer(
         env=env,
         algorithm=algorithm,
@@ -110,7 +110,9 @@ def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
     return frames // env.steps_per_decision
 
 
-def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
+def begin_from(
+    algorithm: Algorithm, config: Mapping[str, Any], interface: Mapping[str, Any] | None = None
+) -> list[str]:
     """Load the trained weights of the run that ``init_from`` names into an algorithm's networks.
 
     Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
@@ -121,13 +123,14 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
         algorithm: The algorithm of the new run.
         config: Its configuration. ``init_from`` is the folder of the other run, whose newest
             checkpoint is read, or a checkpoint.
+        interface: ``interface`` of the new run's environment; None: it is not compared.
 
     Returns:
         Names of the networks that were loaded.
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
-            shapes. Then nothing has been changed.
+            shapes or were trained on other observations. Then nothing has been changed.
     """
     source = Path(config["init_from"])
     if not source.exists():
@@ -138,6 +141,8 @@ def begin_from(algorithm: Algorithm, config: Mapping[str, Any]) -> list[str]:
             f"init_from={source}: there is no checkpoint. Give the folder of a run, or a file in "
             "its folder 'checkpoints'."
         )
+    if interface is not None:
+        check_interface(checkpoint, interface)
     same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _estimated(config))
     taken = {
         name: network

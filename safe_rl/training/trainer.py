@@ -86,6 +86,7 @@ class Trainer:
         if isinstance(collector, Collector) and env.get_state() is not None:
             self._snapshot = EnvSnapshot(env, collector)
         self._is_continued = False
+        self.interface = env.interface
         self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
         if self._first_steps is not None:
             (self._snapshot or collector).stagger(self._first_steps)
@@ -103,6 +104,7 @@ class Trainer:
             keep_last=config.checkpoint.keep_last,
             keep_best=config.checkpoint.get("keep_best", 1),
             run=run,
+            interface=self.interface,
         )
 
     def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:

@@ -5,10 +5,17 @@ import numpy as np
 import pytest
 import torch
 from gymnasium_envs import make_pendulum
+from run_configs import compose_config
+from torchrl.checkpoint import CheckpointError
 
 import safe_rl
 from safe_rl.algorithms import OffPolicy
-from safe_rl.collectors import Recording, describe_env, read_action_bounds, read_recording
+from safe_rl.collectors import (
+    Recording,
+    read_columns,
+    read_recording,
+    safety_gymnasium_columns,
+)
 from safe_rl.envs import make_env
 
 h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
@@ -84,22 +91,24 @@ def test_a_clone_does_in_the_raw_environment_what_the_file_says(family, tmp_path
     tolerance = 0.02 * abs(returns.mean()) + 3 * returns.std() * (2 / 12) ** 0.5
     assert abs(found.estimates["episode_return"].value - returns.mean()) <= tolerance
     steps = read_recording(run.directory / "evaluation.transitions")
-    bounds = read_action_bounds(run.directory / "evaluation.transitions")
-    low, high, own_low, own_high = bounds
+    bounds = read_columns(run.directory / "evaluation.transitions")["actions"].values()
+    low, high, own_low, own_high = map(torch.tensor, bounds)
     own = own_low + (steps["action"].clamp(low, high) - low) / (high - low) * (own_high - own_low)
     assert own.median().item() == pytest.approx(action, abs=0.05)
 
 
-def learned_actions(path, env):
-    """Actions in the replay buffer of a clone, in order of the columns of the path's steps."""
-    from run_configs import compose_config
-
+def learned(path, env, *overrides, name="PointGoal1"):
+    """The replay buffer of a clone of a dataset."""
     config = compose_config(
-        *("algo=bc", "env=gymnasium", "env.id=Battery-v0", f"dataset.path={path}"),
-        *("model.hidden_sizes=[8]", "memory.batch_size=4", "cost_limits={cost: 1e6}"),
+        *("algo=bc", f"env={name}", f"dataset.path={path}", "cost_limits={cost: 1e6}"),
+        *("model.hidden_sizes=[8]", "memory.batch_size=4", *overrides),
     )
-    buffer = OffPolicy.build(config, env).replay_buffer
-    return torch.cat([batch["action"] for batch in buffer.minibatches(20)]).unique().tolist()
+    return torch.cat([*OffPolicy.from_config(config, env).replay_buffer.minibatches(20)])
+
+
+def learned_actions(path, env):
+    steps = learned(path, env, "env.id=Battery-v0", name="gymnasium")
+    return steps["action"].unique().tolist()
 
 
 @pytest.mark.parametrize(
@@ -132,9 +141,107 @@ def test_recorded_actions_are_those_of_the_policy(tmp_path):
     )
     steps = env.rollout(10)
     steps["action"].fill_(-1.5)
-    Recording(tmp_path / "known", env.cost_keys, describe_env(env)).write(0, steps)
+    Recording(tmp_path / "known", env.cost_keys, env.interface).write(0, steps)
     assert learned_actions(tmp_path / "known", env) == [-1.0]
     steps["action"].fill_(0.25)  # of an environment whose policies act in its own units
     about = {"actions": {"low": [0.0], "high": [2.0], "own_low": [0.0], "own_high": [2.0]}}
     Recording(tmp_path / "other", env.cost_keys, about).write(0, steps)
     assert learned_actions(tmp_path / "other", env) == [-0.75]
+
+
+def test_columns_are_taken_by_their_names(tmp_path):
+    env = make_env("PointGoal1", num_envs=1, seed=0)
+    write_episodes(tmp_path / "own.hdf5", "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
+    with h5py.File(tmp_path / "own.hdf5", "a") as file:
+        seen, names = file["observations"][:], env.column_names
+        expected = torch.from_numpy(seen)
+        theirs = safety_gymnasium_columns(names)
+        order = [names.index(name) for name in theirs]
+        for key in ("observations", "next_observations"):
+            file[key][...] = file[key][:][:, order]
+    with pytest.raises(ValueError, match=r"columns of its observations leave the bounds.*safety_g"):
+        learned(tmp_path / "own.hdf5", env)
+
+    def check(path, *overrides):
+        found = learned(path, env, *overrides)["observation"]
+        assert {tuple(row) for row in found.tolist()} <= {tuple(row) for row in expected.tolist()}
+
+    check(tmp_path / "own.hdf5", "dataset.columns=safety_gymnasium")
+    (tmp_path / "own.hdf5").rename(tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5")
+    with pytest.raises(ValueError, match=r"is of SafetyPointGoal1Gymnasium-v0, whose columns"):
+        learned(tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5", env)
+    path = (tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5").rename(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        file.attrs["observation_columns"] = theirs
+    check(path)
+    with h5py.File(path, "a") as file:
+        renamed = [name.replace("vases", "gremlins") for name in theirs]
+        file.attrs["observation_columns"] = renamed
+    with pytest.raises(ValueError, match="have gremlins_lidar, where this environment has vases_l"):
+        learned(path, env)
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [
+        ("PointGoal1", "accelerometer velocimeter gyro magnetometer goal hazards vases"),
+        ("PointButton2", "accelerometer velocimeter gyro magnetometer buttons goal hazards grem"),
+        (
+            "CarPush1",
+            "accelerometer velocimeter gyro magnetometer ballangvel_rear ballquat_rear "
+            "goal hazards pillars box",
+        ),
+        (
+            "DoggoGoal0",
+            "accelerometer velocimeter gyro magnetometer touch_ankle_1a touch_ankle_2a "
+            "touch_ankle_3a touch_ankle_4a touch_ankle_1b touch_ankle_2b touch_ankle_3b "
+            "touch_ankle_4b jointvel_hip_1_z jointvel_hip_2_z jointvel_hip_3_z jointvel_hip_4_z "
+            "jointvel_hip_1_y jointvel_hip_2_y jointvel_hip_3_y jointvel_hip_4_y jointvel_ankle_1 "
+            "jointvel_ankle_2 jointvel_ankle_3 jointvel_ankle_4 jointpos_hip_1_z jointpos_hip_2_z "
+            "jointpos_hip_3_z jointpos_hip_4_z jointpos_hip_1_y jointpos_hip_2_y jointpos_hip_3_y "
+            "jointpos_hip_4_y jointpos_ankle_1 jointpos_ankle_2 jointpos_ankle_3 jointpos_ankle_4 "
+            "goal",
+        ),
+    ],
+)
+def test_the_order_of_safety_gymnasium(name, order):
+    """As its source has it: bases/base_agent.py, bases/base_task.py and the tasks of 1.0."""
+    names = safety_gymnasium_columns(make_env(name, num_envs=1, seed=0).column_names)
+    kinds = [*dict.fromkeys(name.partition("[")[0] for name in names)]
+    assert len(kinds) == len(order.split())
+    assert all(map(str.startswith, kinds, order.split()))
+
+
+def test_a_file_without_names_is_used_with_a_warning(tmp_path):
+    write_episodes(tmp_path / "data.hdf5", "Battery-v0", 0.5)
+    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"})
+    config = compose_config(
+        *("algo=bc", "env=gymnasium", "env.id=Battery-v0", f"dataset.path={tmp_path}/data.hdf5"),
+        *("model.hidden_sizes=[8]", "memory.batch_size=4", "cost_limits={cost: 1e6}"),
+    )
+    assert "does not name the columns" in OffPolicy.from_config(config, env).learns_from
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        (
+            {"observe_vases": False, "observe_gremlins": True, "gremlins_num": 2},
+            "they have vases_lidar, where this environment has gremlins_lidar",
+        ),
+        (
+            {"lidar_type": "natural"},
+            "their lidar_type is pseudo, and that of this environment natural",
+        ),
+    ],
+)
+def test_a_policy_is_refused_where_other_sensors_have_its_size(keys, told, tmp_path):
+    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 40, "logger": "none", "algo": "ppo"}
+    run = safe_rl.train("PointGoal1", directory=tmp_path / "first", **small)
+    with pytest.raises(CheckpointError, match=told):
+        run.evaluate(episodes=1, env=keys)
+    changed = {f"env.{key}": value for key, value in keys.items()}
+    with pytest.raises(CheckpointError, match=told):
+        safe_rl.train("PointGoal1", directory=tmp_path / "b", init_from=run.directory, **small,
+                      **changed)  # fmt: skip

@@ -31,7 +31,7 @@ def head_south(observation):
 
 def record(folder, *policies, num_steps=20, batches=2):
     """Episodes of policies one after the other, as runs record them."""
-    recording, number = Recording(folder, PointMass.cost_keys), 0
+    recording, number = Recording(folder, PointMass.cost_keys, PointMass().interface), 0
     for policy in policies:
         env = PointMass(4, num_steps)
         module = TensorDictModule(policy, ["observation"], ["action"])

@@ -44,6 +44,8 @@ from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goals_met
 from safe_rl.envs.safety_gym.warp_backend import make_warp_physics
 from safe_rl.envs.simulated import SimulatedEnv, require_episodes
 
+_LIDAR = ("lidar_type", "lidar_max_dist", "lidar_exp_gain", "lidar_alias")
+
 
 class SafetyGymEnv(SimulatedEnv):
     """N parallel worlds of one Safety Gym configuration, stepped together on a thread pool.
@@ -135,6 +137,12 @@ class SafetyGymEnv(SimulatedEnv):
     def observation_bounds(self) -> dict[str, tuple[float, float]]:
         """Lowest and highest value of every named component in `observation`."""
         return dict(self._observer.bounds)
+
+    @property
+    def sensor_keys(self) -> dict[str, Any]:  # type: ignore[override]
+        """Keys that change the readings of lidars, but not their number."""
+        has_lidar = any(name.endswith("_lidar") for name in self.observation_layout)
+        return {key: getattr(self.config, key) for key in _LIDAR if has_lidar}
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)

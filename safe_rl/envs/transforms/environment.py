@@ -36,7 +36,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         super().__init__(base_env, Compose(*transforms.values()))
         self.max_episode_steps = base_env.max_episode_steps
         self.seconds_per_step = base_env.seconds_per_step
-        self.events = base_env.events
+        self.events, self.sensor_keys = base_env.events, base_env.sensor_keys
         self._ours = {n: t for n, t in transforms.items() if isinstance(t, ConstraintTransform)}
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
