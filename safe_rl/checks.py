@@ -151,7 +151,7 @@ def _signature(function: Callable[..., Any]) -> Signature:
 
 
 def checked(function: Function) -> Function:
-    """Let a function refuse settings that its annotations do not allow.
+    """Let a function, or a class, refuse settings that its annotations do not allow.
 
     Examples:
         >>> @checked
@@ -161,6 +161,9 @@ def checked(function: Function) -> Function:
         ...
         safe_rl.checks.SettingError: gamma=true: it must be a valid number.
     """
+    if isclass(function):
+        function.__init__ = checked(function.__init__)  # type: ignore[misc]
+        return function
 
     @cache
     def checks() -> dict[str, TypeAdapter[Any]]:

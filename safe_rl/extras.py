@@ -64,7 +64,7 @@ def import_extra(module: str, extra: str) -> Any:
 
 
 def needs_extra(module: str, extra: str) -> Callable[[T], T]:
-    """Mark a class or function that needs a package of an extra; `read_part` checks this."""
+    """Mark a class or function that needs a package of an extra; `check_settings` checks this."""
 
     def note(part: T) -> T:
         part.needed_extra = (module, extra)  # type: ignore[attr-defined]

@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig
 
+import safe_rl.cli.config  # noqa: F401, Hydra's ConfigStore gets the general keys
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF
 

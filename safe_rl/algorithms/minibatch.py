@@ -22,7 +22,7 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
-from safe_rl.checks import Share, Weight
+from safe_rl.checks import Share, Weight, checked
 from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.policy_projections import CUPLoss
@@ -31,6 +31,7 @@ from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.ranges import PART
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class KLAdaptiveRate:
     """Lower the learning rate if max_kl ends updates early, raise it if the KL stays small.

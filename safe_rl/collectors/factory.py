@@ -14,6 +14,7 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
+from safe_rl.checks import checked
 from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
@@ -72,6 +73,7 @@ def make_collector(
     )
 
 
+@checked
 def make_process_collector(  # noqa: D417
     env: EnvBase,
     make_env: MakeEnv,
@@ -107,6 +109,7 @@ def make_process_collector(  # noqa: D417
 
 
 @needs_extra("ray", "ray")
+@checked
 def make_ray_collector(  # noqa: D417
     env: EnvBase,
     make_env: MakeEnv,

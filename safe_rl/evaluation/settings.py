@@ -10,7 +10,6 @@ from annotated_types import Interval
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.checks import Fraction, Share, check_value, rule
-from safe_rl.ranges import Values
 
 PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
@@ -27,8 +26,9 @@ def _is_device(value: Any) -> bool:
     return (device.index or 0) < here.get(device.type, 0)
 
 
-_WHERE = "cpu; or cuda or cuda:<number>, if torch finds this GPU here"
-Device = Annotated[str, rule(_is_device, _WHERE), Values(_is_device, _WHERE)]
+Device = Annotated[
+    str, rule(_is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
+]
 _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )

@@ -1,0 +1,324 @@
+"""The keys of a run that belong to no part: types for Hydra, ranges for pydantic.
+
+Hydra composes every configuration on top of `General`, so it refuses unknown keys and values of
+another type. OmegaConf does not know ranges: `check_settings` checks them once, when a run starts.
+Defaults are in ``conf/``. Settings of parts, which have a ``_target_``, are described and checked
+by the parts' constructors; an environment checks its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, is_dataclass
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+from annotated_types import Interval
+from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig, OmegaConf, open_dict
+from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveFloat
+
+from safe_rl.checks import SettingError, Text, check_value, rule
+from safe_rl.evaluation.settings import CertificateOptions, Device
+from safe_rl.extras import require_extra
+from safe_rl.naming import did_you_mean, join_keys
+from safe_rl.trust import locate
+
+
+def typed(kind: Any) -> GetPydanticSchema:
+    """Metadata of ``Annotated[Any, …]``: a type for pydantic alone.
+
+    OmegaConf does not know all types. It refuses 3e5 as an `int`, and merges a mapping that the
+    command line gives into a typed one.
+    """
+    return GetPydanticSchema(lambda _, handler: handler(kind))
+
+
+Whole = Annotated[Any, typed(Annotated[int, Interval(ge=1, le=10**15)])]
+"""A whole number above 0, which may be written as 3e5."""
+Kept = Annotated[int, Interval(ge=1, le=10_000)]
+Width = Annotated[int, Interval(ge=1, le=16_384)]
+Folder = Annotated[Text, rule(lambda name: "/" not in name, "a name of a folder, without /")]
+
+
+@dataclass
+class Checkpoint:
+    """When checkpoints are written, and which are kept: the section ``checkpoint``.
+
+    Attributes:
+        interval: Seconds between checkpoints.
+        keep_last: Number of last checkpoints that are kept.
+        keep_best: Number of best checkpoints that are kept besides.
+        best_over: Epochs in the mean return and costs by which checkpoints are compared.
+    """
+
+    interval: NonNegativeFloat
+    keep_last: Kept
+    keep_best: Kept
+    best_over: Kept
+
+
+@dataclass
+class Evaluation:
+    """Evaluations while training: the section ``evaluation``.
+
+    Attributes:
+        interval: Steps between evaluations.
+        episodes: Episodes of an evaluation.
+    """
+
+    interval: Whole
+    episodes: Annotated[int, Interval(ge=1, le=10**6)]
+
+
+@dataclass
+class Dataset:
+    """Transitions that are in the replay buffer from the beginning: the section ``dataset``.
+
+    Attributes:
+        path: Folder of a recording, or an HDF5 file.
+        columns: Order of observed columns in a file that does not name them; null: the environment's.
+        safe_episodes: Whether only episodes within the limits are taken.
+        alone: Whether to learn from the dataset only.
+    """
+
+    path: Text | None
+    columns: Annotated[Any, typed(Literal["safety_gymnasium"] | None)]
+    safe_episodes: bool
+    alone: bool
+
+
+@dataclass
+class Critics:
+    """Sizes of the ensembles of Q functions: the section ``critics``.
+
+    Attributes:
+        rewards: Number of Q functions of the reward.
+        costs: Number of Q functions of the costs.
+    """
+
+    rewards: Annotated[int, Interval(ge=0, le=1000)]
+    costs: Annotated[int, Interval(ge=0, le=1000)]
+
+
+@dataclass
+class Exploration:
+    """Exploration of off-policy algorithms: the section ``exploration``.
+
+    Attributes:
+        random_steps: Random steps at the beginning.
+        noise: Standard deviation of a deterministic policy's noise, in half ranges of actions.
+    """
+
+    random_steps: Annotated[Any, typed(NonNegativeInt)]
+    noise: NonNegativeFloat
+
+
+@dataclass
+class Encoders:
+    """Encoders of the entries of an observation: the section ``model.encoders``.
+
+    Attributes:
+        vector: Widths of the layers for a vector.
+        channels: Channels of the convolutions for an image.
+        kernels: Kernel sizes of these convolutions [pixels].
+        strides: Strides of these convolutions [pixels].
+    """
+
+    vector: list[Width]
+    channels: list[Width]
+    kernels: list[Width]
+    strides: list[Width]
+
+
+@dataclass
+class Recurrence:
+    """A recurrent layer: the section ``model.memory``.
+
+    Attributes:
+        size: Size of the recurrent state.
+    """
+
+    size: Width
+
+
+@dataclass
+class Model:
+    """The networks: the section ``model``, unless a ``_target_`` names a function of one's own.
+
+    Attributes:
+        hidden_sizes: Widths of the hidden layers.
+        initial_log_std: Logarithm of the initial standard deviation of actions.
+        input_scale: Factors by component of the observation.
+        head: Distribution of the actions.
+        normalise: Bound of normalised observations; null: they are not normalised.
+        encoders: Encoders of the entries of an observation.
+        memory: A recurrent layer.
+    """
+
+    hidden_sizes: list[Width]
+    initial_log_std: Annotated[float, Interval(ge=-20, le=10)]
+    input_scale: dict[str, PositiveFloat]
+    head: Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
+    normalise: PositiveFloat | None
+    encoders: Encoders | None
+    memory: Recurrence | None
+
+
+@dataclass
+class Algo:
+    """The algorithm: the section ``algo``. An algorithm of one's own may have further keys there.
+
+    Attributes:
+        name: Its name in folders and reports.
+        constrained: Whether it keeps the limits; otherwise costs are only recorded.
+    """
+
+    name: Folder
+    constrained: bool
+
+
+@dataclass(init=False, repr=False, eq=False)
+class General:
+    """The keys at the top of a configuration; those of type `Any` hold parts, or have no value.
+
+    Attributes:
+        frames: Environment steps to train for.
+        num_envs: Environments that are stepped together.
+        frames_per_batch: Steps of all environments in one batch.
+        staggered_starts: Whether environments begin at different steps of their first episodes.
+        seed: Seed of the run.
+        cost_limits: Cost allowed per episode, by cost: ``cost_limits='{cost: 25}'``.
+        init_from: Run or checkpoint whose trained networks this run starts from.
+        record: Whether all transitions are written to disk.
+        note: A note, kept in the run's config.yaml.
+        device: Where networks are trained: cpu or cuda.
+        num_threads: Threads of physics and torch; null: all cores.
+        compile: Whether to compile the losses of on-policy algorithms.
+        checkpoint: When checkpoints are written.
+        certificate: The test at the end of a run, see `CertificateOptions`.
+        env: The environment.
+        transforms: Changes of the problem, by name.
+        collector: Where environments are stepped.
+        logger: A logger besides progress.csv.
+        algo: The algorithm.
+        model: The networks, see `Model`.
+        risk: The measure of episode costs that is limited.
+        limits: How the limit is approached.
+        lagrangian: The multiplier.
+        loss: The loss of the policy.
+        policy_update: The update of the policy.
+        advantage: Estimator of the reward's advantages.
+        cost_advantage: Estimator of the costs' advantages.
+        critic_update: The update of the critics.
+        memory: The replay buffer.
+        actor: The policy of off-policy algorithms.
+        critics: Sizes of the ensembles of Q functions.
+        exploration: Exploration of off-policy algorithms.
+        dataset: Transitions that are in the replay buffer from the beginning.
+        evaluation: Evaluations while training; null: none.
+    """
+
+    frames: Whole
+    num_envs: Whole
+    frames_per_batch: Whole
+    staggered_starts: bool | None
+    seed: Annotated[int, Interval(ge=0, le=2**62)]
+    cost_limits: Annotated[Any, typed(dict[str, NonNegativeFloat])]
+    init_from: Text | None
+    record: bool
+    note: Any
+    # modules of the user: a keyword of Python, which only a text can name
+    __annotations__["import"] = "list[str]"
+    device: Device
+    num_threads: Annotated[int, Interval(ge=1, le=1024)] | None
+    compile: bool
+    checkpoint: Checkpoint
+    certificate: Any
+    env: Any
+    transforms: Any
+    collector: Any
+    logger: Any
+    algo: Any
+    model: Any
+    risk: Any
+    limits: Any
+    lagrangian: Any
+    loss: Any
+    policy_update: Any
+    advantage: Any
+    cost_advantage: Any
+    critic_update: Any
+    memory: Any
+    actor: Any
+    critics: Critics | None
+    exploration: Exploration | None
+    dataset: Dataset | None
+    evaluation: Evaluation | None
+    # until the pages of conf/ have no shared presets
+    preset: Any
+    paper: Any
+    replay: Any
+    default_cost_limits: Any
+
+
+ConfigStore.instance().store(name="general", node=General)
+
+
+def check_settings(config: DictConfig) -> None:
+    """Check a composed configuration, before anything is built.
+
+    Sections that its algorithm does not have are removed, and whole numbers that are written as 3e5
+    become integers.
+
+    Raises:
+        SettingError: For a key that does not exist or is out of range; the message names it.
+    """
+    with open_dict(config):
+        for name in [key for key in config if OmegaConf.is_missing(config, key)]:
+            del config[name]
+    _check(General, config, "")
+    _check(Algo, config.algo, "algo", is_open=True)
+    _check(CertificateOptions, config.certificate, "certificate")
+    if "_target_" not in config.model:
+        _check(Model, config.model, "model")
+    check_value("env.name", Folder, config.env.name)
+    for key in ("collector", "logger"):
+        target = config[key].get("_target_")
+        extra = getattr(locate(target, f"{key}._target_"), "needed_extra", None) if target else None
+        if extra is not None:
+            try:
+                require_extra(*extra)
+            except ModuleNotFoundError as error:
+                raise SettingError(f"{key}: {error}") from None
+    if not config.collector.get("_target_") and config.collector.get("num_collectors") != 1:
+        raise SettingError(
+            "collector.num_collectors: collector=local is one process; for more use "
+            "collector=process or collector=ray."
+        )
+    cap = config.certificate.get("cap")
+    if cap is not None and any(cap <= limit for limit in config.cost_limits.values()):
+        raise SettingError(f"certificate.cap={cap}: it must be above every limit of cost_limits.")
+
+
+def _check(section: type, values: DictConfig, above: str, *, is_open: bool = False) -> None:
+    """Check the keys of a section, a dataclass; an open one may have others."""
+    hints = get_type_hints(section, include_extras=True)
+    for name, value in values.items():
+        key = join_keys(above, str(name))
+        if name not in hints:
+            if is_open or key == "hydra":
+                continue
+            raise SettingError(f"{key}: there is no such key.{did_you_mean(str(name), hints)}")
+        kinds = [*filter(_is_section, (hints[name], *get_args(hints[name])))]
+        if kinds and value is not None:
+            _check(kinds[0], value, key)
+        elif not kinds:
+            plain = (
+                OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            )
+            checked = check_value(key, hints[name], plain)
+            if isinstance(value, float) and isinstance(checked, int):
+                values[name] = checked
+
+
+def _is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and is_dataclass(kind)
