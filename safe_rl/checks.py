@@ -8,6 +8,7 @@ networks and tensors, are not checked.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from inspect import Parameter, Signature, isclass, signature
@@ -22,6 +23,12 @@ _PLAIN = (int, float, str, list, tuple, Mapping, type(None))  # not networks, te
 
 class SettingError(ValueError):
     """A setting that cannot be used; the message is one line and begins with its name."""
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a number that a float can hold, and finite; True and False are not."""
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and abs(value) <= sys.float_info.max
 
 
 def rule(holds: Callable[[Any], bool], words: str) -> AfterValidator:

@@ -28,7 +28,6 @@ from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.policy_projections import CUPLoss
 from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.ranges import PART
 
 
 @checked
@@ -134,13 +133,13 @@ class MinibatchUpdate(PolicyUpdate):
         self,
         loss: LossModule,
         *,
-        optimizer: Annotated[Callable[[Iterable[nn.Parameter]], Optimizer], PART],
+        optimizer: Callable[[Iterable[nn.Parameter]], Optimizer],
         num_passes: Annotated[int, Interval(ge=1, le=10**9)],
         minibatch_size: PositiveInt | None,
         max_kl: PositiveFloat | None = None,
         step_beyond_kl: bool = False,
         max_grad_norm: PositiveFloat | None = None,
-        adapt_rate: Annotated[KLAdaptiveRate, PART] | None = None,
+        adapt_rate: KLAdaptiveRate | None = None,
         compile: bool = False,
     ) -> None:
         if adapt_rate is not None and max_kl is None:

@@ -22,7 +22,6 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.checks import Checked
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
-from safe_rl.ranges import PART
 
 _NO_GRAPH = (
     "If the loss reads numbers on the host (.item()) or branches on them (if), its gradient steps "
@@ -74,7 +73,7 @@ class ReplayUpdate(Checked):
         self,
         loss: ReplayLoss,
         *,
-        optimizer: Annotated[Callable[[Iterable[Any]], Optimizer], PART],
+        optimizer: Callable[[Iterable[Any]], Optimizer],
         updates_per_step: PositiveFloat,
         tau: Annotated[float, Interval(gt=0, le=0.5)] | None,
         policy_delay: Annotated[int, Interval(ge=1, le=10_000)] = 1,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.checks import check_value
 from safe_rl.cli.report import suite
 from safe_rl.cli.run_folders import maker_of
-from safe_rl.cli.schema import KEYS
 from safe_rl.evaluation import (
     Certificate,
     CertificateOptions,
@@ -68,11 +68,11 @@ def certificate_options(
     ``risk=cvar`` the mean cost of the costliest episodes.
     """
     options = dict(config.certificate)
+    kinds = get_type_hints(CertificateOptions, include_extras=True)
     for name, value in (changes or {}).items():
         if name not in options:
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
-        KEYS[f"certificate.{name}"].check(f"certificate.{name}", value)
-        options[name] = value
+        options[name] = check_value(f"certificate.{name}", kinds[name], value)
     if not options["episodes"]:  # training was to end without a certificate
         options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     # with risk=mean the section may still have numbers, such as the tail of WCSAC's critics

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -18,7 +18,6 @@ from safe_rl.checks import checked
 from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
 from safe_rl.processes import starting_processes
-from safe_rl.ranges import Options
 
 
 def make_collector(
@@ -118,8 +117,8 @@ def make_ray_collector(  # noqa: D417
     frames_per_batch: int,
     num_collectors: Annotated[int, Interval(ge=1, le=1024)],
     device: torch.device | str,
-    ray_init: Options,
-    resources: Options,
+    ray_init: dict[str, Any],
+    resources: dict[str, Any],
 ) -> WorkerCollector:
     """Collect in actors of a Ray cluster; for other arguments see `WorkerCollector`.
 

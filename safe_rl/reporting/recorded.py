@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.ranges import is_number
+from safe_rl.checks import is_number
 from safe_rl.reporting.tables import clean
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.outcome import final_figures, judges_another_measure, violation

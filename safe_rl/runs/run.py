@@ -15,8 +15,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.checks import is_number
 from safe_rl.files import read_config, read_json, read_yaml
-from safe_rl.ranges import is_number
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
 from safe_rl.runs.outcome import final_figures, violation
 from safe_rl.runs.table import read_table

@@ -15,7 +15,6 @@ from torchrl.data import Bounded, OneHot, TensorSpec
 from safe_rl.checks import Text
 from safe_rl.envs.transforms.base import ConstraintTransform
 from safe_rl.naming import STEPS_TAKEN
-from safe_rl.ranges import PART
 
 
 def _parameters(function: Callable[..., Any]) -> set[str]:
@@ -65,7 +64,7 @@ class ActionFilter(ConstraintTransform):
 
     def __init__(
         self,
-        filter: Annotated[Callable[..., Tensor], PART],
+        filter: Callable[..., Tensor],
         *,
         cost_key: Text = "cost_interventions",
     ) -> None:
