@@ -49,7 +49,8 @@ def test_every_setting_of_every_part_has_a_range_or_choices(algo):
             continue
         known = parameters_of(trust.locate(node._target_))
         for name, value in node.items():
-            if name[0] != "_" and not (OmegaConf.is_dict(value) and "_target_" in value):
+            is_part = OmegaConf.is_dict(value) and "_target_" in value
+            if name[0] != "_" and not is_part and value is not None:
                 assert is_setting(known[name].annotation), f"{path}.{name}"
 
 
