@@ -75,7 +75,7 @@ class Dataset:
 
     Attributes:
         path: Folder of a recording, or an HDF5 file.
-        columns: Order of observed columns in a file that does not name them; null: the environment's.
+        columns: Order of observed columns in a file that does not name them; null: as here.
         safe_episodes: Whether only episodes within the limits are taken.
         alone: Whether to learn from the dataset only.
     """
