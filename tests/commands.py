@@ -5,7 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+
 from safe_rl.cli import train
+from safe_rl.cli.composing import check_risk, compose_run
+from safe_rl.cli.schema import check_settings
 
 ROOT = Path(__file__).parents[1]
 SMALL = (
@@ -18,9 +25,28 @@ SMALL = (
 def status_of(*arguments: str) -> object:
     """Its exit status, or the line that it ends with."""
     try:
-        return train.main(arguments)
+        train.main(arguments)
+        return 0
     except SystemExit as end:
         return end.code
+
+
+def composed(*words: str) -> list[DictConfig]:
+    """The checked configurations that a command line begins runs with, at most four of a sweep."""
+    words = train.prepare(words)
+    folders = [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
+    names = [word.partition("=")[2] for word in words if word.startswith("--config-name=")]
+    words = [word for word in words if not word.startswith("-")]
+    try:
+        overrides = OverridesParser.create().parse_overrides(words)
+        jobs = BasicSweeper.split_arguments(overrides, None)[0]
+    except HydraException:
+        jobs = [words]
+    configs = [compose_run(job, folders, *names) for job in jobs[:2] + jobs[2:][-2:]]
+    for config in configs:
+        check_settings(config)
+        check_risk(config)
+    return configs
 
 
 def run_train(*arguments: str) -> None:

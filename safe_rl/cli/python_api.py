@@ -14,18 +14,19 @@ from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import torch
+from hydra.core.config_store import ConfigStore
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
+from safe_rl.cli.composing import check_risk, compose_run, overrides_of
 from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
-from safe_rl.cli.grammar import CommandLineError, overrides_of
 from safe_rl.cli.options import make_options
+from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
 from safe_rl.cli.run_folders import maker_of
-from safe_rl.cli.schema import GIVEN_WHOLE
+from safe_rl.cli.schema import check_settings
 from safe_rl.cli.session import Session
-from safe_rl.cli.train import read_command
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports
+from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
@@ -40,9 +41,6 @@ if TYPE_CHECKING:
     import pandas
 
 Callback = Callable[[Mapping[str, float]], Any]
-# mappings that are given all at once
-_WHOLE = [*GIVEN_WHOLE, "env.outside", "env.kwargs", "env.cost", "memory.prioritised"]
-_WHOLE += ["policy_update.rates"]
 
 
 def train(
@@ -86,16 +84,19 @@ def train(
         [40.0, 80.0]
     """
     if not (isinstance(env, str) and isinstance(algo, str)):
-        raise CommandLineError(
+        raise ValueError(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
     if "resume" in settings:
-        raise CommandLineError("safe_rl.resume(directory) continues a run.")
+        raise ValueError("safe_rl.resume(directory) continues a run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
-    words = [f"env={env}", f"algo={algo}", *overrides_of(settings, _WHOLE)]
-    words += [f"--config-dir={place}" for place in folders]
-    (config,) = read_command([*words, *note_imports(imports or None)]).configs
+    modules = [imports] if isinstance(imports, str) else list(imports)
+    import_modules(modules)
+    more = {"import": modules} if modules else {}
+    config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
+    check_settings(config)
+    check_risk(config)
     folder = None if directory is None else Path(directory).expanduser()
     return _carry_out(Session(config, folder, program=None, callbacks=callbacks))
 
@@ -129,8 +130,12 @@ def resume(
         [40.0, 80.0]
     """
     folder = Path(directory).expanduser()
-    words = [f"resume={folder}", *overrides_of(settings, _WHOLE), *note_imports(imports)]
-    (config,) = read_command(words).configs
+    modules = [imports] if isinstance(imports, str) else imports
+    import_modules(modules)
+    words = list(overrides_of(settings))
+    ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
+    config = compose_run(words, name=RESUMED)
+    refuse_changes(folder.absolute(), config)
     return _carry_out(Session(config, folder, continues=True, program=None, callbacks=callbacks))
 
 

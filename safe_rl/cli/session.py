@@ -18,10 +18,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.composing import check_risk, is_to_keep_limits, resolving
+from safe_rl.cli.composing import is_to_keep_limits
 from safe_rl.cli.evaluating import certify_run
 from safe_rl.cli.run_folders import keep_robot, new_folder, robot_of
-from safe_rl.cli.schema import check_settings, plain
+from safe_rl.cli.schema import plain
 from safe_rl.cli.user_code import imported, make_after_imports
 from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
@@ -72,10 +72,9 @@ class Session:
     ) -> None:
         # a new folder is removed if the run cannot begin
         if folder is None:
-            with resolving(config):
-                folder, self._is_new = new_folder(config.hydra)
-        else:
-            self._is_new = not folder.exists()
+            folder, self._is_new = new_folder(config.hydra)
+        else:  # Hydra has made the folder of a new run
+            self._is_new = not (folder.exists() and any(folder.iterdir()))
         with open_dict(config):
             self.hydra = config.pop("hydra", None)
         self.config, self.folder = config, Run(folder)
@@ -283,10 +282,6 @@ def run_job(config: DictConfig, hydra: DictConfig) -> float:
         ValueError: If its folder holds a run with other settings.
     """
     folder = Run(Path(hydra.runtime.output_dir).resolve())
-    check_settings(config)
-    check_risk(config)  # for this combination of a sweep's values
-    with open_dict(config):
-        config.hydra = hydra
     Session(config, folder.directory, continues=True).run()
     limits = dict(config.cost_limits)
     figures = final_figures(read_table(folder.table_file), list(limits))

@@ -1,206 +1,151 @@
-"""The command ``train.py``: it reads its arguments and starts a run, a sweep or Hydra's output.
+"""What ``train.py`` does around Hydra: words of our own before it, a run after it.
 
-The modules of training are imported when a run begins, so that help and errors appear at once.
+Hydra itself reads the command line, composes the configuration, and starts sweeps. The modules of
+training are imported when a run begins, so that help and errors appear at once.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any
 
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
-from safe_rl.cli.composing import (
-    compose_jobs,
-    compose_resumed,
-    hydra_on_conf,
-    resolving,
-    search_folders,
-)
-from safe_rl.cli.grammar import CommandLineError, parse, say_interruptions, split_imports, take_word
-from safe_rl.cli.user_code import import_modules, note_imports
+from safe_rl.cli.composing import check_risk, explain, name_choices, overrides_of
+from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
+from safe_rl.cli.schema import check_settings
+from safe_rl.cli.sweeps import run_in_sweep
+from safe_rl.cli.user_code import import_modules, split_imports, take_word
+from safe_rl.envs import store_configs
+from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES
 
-_FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
-    "--help -h": ("show environments, algorithms and all settings", {}),
-    "--hydra-help": ("show these flags and Hydra's settings", {}),
-    "--shell-completion -sc": ("tab completion: -sc install=bash", {}),
-    "--multirun -m": ("a sweep: a run for every combination of values", {}),
-    "--config-dir -cd": ("folder with your YAML files; may be repeated", {"action": "append"}),
-    "--cfg -c": ("show the configuration", {"choices": ("job", "hydra", "all")}),
-    "--package -p": ("with --cfg: show only this part", {"action": "store"}),
-    "--resolve": ("with --cfg: show values, not references", {}),
-}
-"""Flag and its short form -> its help, and arguments of argparse if it is not a switch."""
 
+def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
+    """Run a function of ``@hydra.main``, with ``import=``, ``slate=`` and ``resume=``.
 
-class Command(NamedTuple):
-    """A command line that has been read.
-
-    Attributes:
-        flags: Flags by their long names, with underscores.
-        overrides: Overrides; shorthands such as ``slate=`` are written out.
-        configs: The checked configurations, those of new runs with the node ``hydra``: one, or for
-            a sweep jobs in which every value occurs; none for ``--help`` and the like.
-        run: Folder of the run that is continued, if any.
-        is_run: Whether it is one run, new or continued. Otherwise Hydra prints something, or starts
-            a sweep.
-    """
-
-    flags: Namespace
-    overrides: list[str]
-    configs: Sequence[DictConfig] = ()
-    run: Path | None = None
-    is_run: bool = False
-
-
-def read_command(words: Sequence[str]) -> Command:
-    """Read a command line; compose and check its configurations before anything is written.
+    Args:
+        main: The function.
+        words: The command's arguments; None: those of the process.
 
     Raises:
-        CommandLineError: If an argument cannot be used; the message says what to write instead.
-        ValueError: If a run, a part or an environment cannot have a value.
+        SystemExit: With a message of one line, if the words cannot be used.
+    """
+    before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors, and does not print them
+    try:
+        sys.argv = [sys.argv[0], *prepare(sys.argv[1:] if words is None else words)]
+        main()
+    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
+        if before[1] == "1":  # the user wants to see the traceback
+            raise
+        sys.exit(explain(error, sys.argv[1:]))
+    except KeyboardInterrupt:
+        sys.exit("Interrupted.")
+    finally:
+        sys.argv = before[0]
+        os.environ.pop("HYDRA_FULL_ERROR")
+        if before[1] is not None:
+            os.environ["HYDRA_FULL_ERROR"] = before[1]
+
+
+def prepare(words: Sequence[str]) -> list[str]:
+    """Turn a command's words into words for Hydra.
+
+    ``import=my_module`` is imported; ``slate=SG6`` becomes the slate's environments (Ray, Achiam,
+    Amodei 2019, section 5.1); for ``resume=RUN`` the run's own configuration takes the place of
+    ``conf/config.yaml``.
+
+    Raises:
+        ValueError: If a module, a slate or a run cannot be used.
 
     Examples:
-        >>> read_command(["slate=SGPoint", "-m", "seed=0"]).configs[0].env.name
-        'PointGoal1'
-    """
-    flags, unknown = _parser().parse_known_intermixed_args(words)
-    if unknown:
-        name, _, value = unknown[0].lstrip("-").partition("=")
-        raise CommandLineError(
-            f"'{unknown[0]}': there is no such flag. A key is written without dashes, "
-            f"{name.replace('-', '_')}={value or '…'}; 'python train.py --hydra-help' names "
-            "the flags."
-        )
-    if flags.help or flags.hydra_help or flags.shell_completion:
-        return Command(flags, flags.overrides)
-    is_sweep = flags.multirun or "hydra.mode=MULTIRUN" in flags.overrides
-    modules, overrides = split_imports(flags.overrides)
+        >>> prepare(["slate=SGPoint", "-m", "seed=0"])
+        ['-m', 'seed=0', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2']
+    """  # noqa: E501
+    store_configs()
+    modules, words = split_imports(words)
     import_modules(modules)
-    resume, overrides = take_word("resume", overrides)
-    if resume:
-        if is_sweep or flags.cfg:
-            raise CommandLineError(
-                "resume= continues one run, which has its configuration in config.yaml: no flag "
-                "goes with it. To continue a sweep, start it again as it was: finished runs are "
-                "skipped, interrupted ones continue."
+    runs, words = take_word("resume", words)
+    slates, words = take_word("slate", words)
+    if runs:
+        directory = Path(runs[-1]).expanduser().absolute()
+        ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, words))
+        return [f"--config-name={RESUMED}", *words]
+    for name in slates:
+        if name not in SLATES:
+            raise ValueError(
+                f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "
+                f"Slates are: {', '.join(SLATES)}."
             )
-        run = Path(resume[-1]).expanduser().absolute()
-        return Command(flags, overrides, [compose_resumed(run, overrides, modules)], run, True)
-    overrides = expand_slate(overrides, is_sweep)
-    overrides = [*search_folders(flags.config_dir or ()), *overrides, *note_imports(modules)]
-    if is_sweep and not flags.cfg:
-        overrides = _with_launcher(overrides)
-    configs = compose_jobs(overrides, sweep=is_sweep, shown=bool(flags.cfg))
-    return Command(flags, overrides, configs, is_run=not (is_sweep or flags.cfg))
+        words.append(f"env={','.join(SLATES[name])}")
+    return [*words, *(overrides_of({"import": modules}) if modules is not None else ())]
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "python train.py") -> int | str:
-    """Run the command; return its exit status, or the error message with which it ends.
+def job(config: DictConfig) -> float | None:
+    """Begin or continue the run of a configuration that Hydra has composed.
+
+    Returns:
+        In a sweep the value that an optimising sweeper maximises: the final return, or −∞ if the
+        run fails, ends above a limit, or ends before its first episode does.
 
     Raises:
-        SystemExit: If a signal has ended the run.
+        SystemExit: If a signal ends the run, or with a message of one line if it cannot go on.
     """
-    say_interruptions()
-    session = None
+    settings = HydraConfig.get()
+    directory = Path(settings.runtime.output_dir)
+    if settings.mode == RunMode.MULTIRUN:
+        return run_in_sweep(config, settings, directory)
     try:
-        command = read_command(sys.argv[1:] if arguments is None else arguments)
-        if not command.is_run:
-            return _ask_hydra(command)
-        from safe_rl.cli.session import Session
+        _run(config, settings, directory)
+    except (OmegaConfBaseException, ValueError) as error:
+        sys.exit(explain(error, sys.argv[1:]))
+    finally:
+        with suppress(OSError):
+            directory.rmdir()  # Hydra has made it; a folder with files stays
+    return None
 
-        (config,) = command.configs
-        run = command.run
-        session = Session(config, run, continues=run is not None, program=program)
+
+def _run(config: DictConfig, settings: DictConfig, directory: Path) -> None:
+    is_resumed = settings.job.config_name == RESUMED
+    if is_resumed:
+        refuse_changes(directory, config)
+    else:
+        name_choices(config, settings.runtime.choices)
+    check_settings(config)
+    check_risk(config)
+    if not is_resumed:
+        with open_dict(config):
+            config.hydra = settings
+    from safe_rl.cli.session import Session  # with torch: help and errors do not need it
+
+    session = Session(config, directory, continues=is_resumed, program="python train.py")
+    try:
         session.run()
     except Exception as error:
-        is_about_words = isinstance(error, ValueError | HydraException | OSError)
-        is_expected = is_about_words if session is None else session.refuses(error)
-        if not is_expected or os.environ.get("HYDRA_FULL_ERROR") == "1":
+        if not session.refuses(error):
             raise
-        return " ".join(str(error).split())
-    return 0
+        sys.exit(" ".join(str(error).split()))
 
 
-class _Parser(ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise CommandLineError(f"{message[:1].upper()}{message[1:]}.")
+@hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")
+def _main(config: DictConfig) -> float | None:
+    return job(config)
 
 
-def _parser() -> ArgumentParser:
-    """A parser of flags and overrides, in any order."""
-    parser = _Parser(add_help=False, allow_abbrev=False)
-    for names, (meaning, kind) in _FLAGS.items():
-        parser.add_argument(*names.split(), help=meaning, **kind or {"action": "store_true"})
-    parser.add_argument("overrides", nargs="*", help="settings, key=value")
-    return parser
-
-
-def expand_slate(words: Sequence[str], is_sweep: bool) -> list[str]:
-    """Replace ``slate=SG6`` by the slate's environments (Ray, Achiam, Amodei 2019, section 5.1)."""
-    given, others = take_word("slate", words)
-    if not given:
-        return others
-    name = given[-1]
-    if any(word.startswith("env=") for word in others):
-        raise CommandLineError(f"slate={name} chooses the environments: leave out env=….")
-    if name not in SLATES:
-        raise CommandLineError(
-            f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} Slates are: {', '.join(SLATES)}."
-        )
-    if len(SLATES[name]) > 1 and not is_sweep:
-        raise CommandLineError(
-            f"{name} is {len(SLATES[name])} environments: add -m to train on every one of them."
-        )
-    return [f"env={','.join(SLATES[name])}", *others]
-
-
-def _with_launcher(words: list[str]) -> list[str]:
-    """A sweep's overrides with joblib's launcher, if it is installed and none is chosen."""
-    with suppress(ModuleNotFoundError):  # if Hydra has no plugin at all
-        is_chosen = any(word.startswith("hydra/launcher=") for word in words)
-        if not is_chosen and find_spec("hydra_plugins.hydra_joblib_launcher"):
-            return [*words, "hydra/launcher=joblib"]
-    return words
-
-
-def _ask_hydra(command: Command) -> int:
-    """Let Hydra print what a flag asks for, or start a sweep; return the exit status."""
-    flags, words = command.flags, command.overrides
-    with hydra_on_conf() as hydra:
-        if flags.help:
-            hydra.app_help("config", _parser(), flags)
-        elif flags.hydra_help:
-            hydra.hydra_help("config", _parser(), flags)
-        elif flags.shell_completion:
-            hydra.shell_completion("config", words)
-        elif flags.cfg:
-            hydra.show_cfg("config", words, flags.cfg, flags.package, flags.resolve)
-        else:
-            from safe_rl.cli.sweeps import Sweep
-
-            first = command.configs[0]
-            with resolving(first):
-                sweep = Sweep(first.hydra, words)
-            try:
-                # Hydra's own plan lacks the keys that only swept choices, such as of algo=, have
-                given = first.hydra.overrides
-                job = ["hydra.mode=MULTIRUN", *given.hydra, *given.task]
-                plan = hydra.compose_config("config", job, RunMode.MULTIRUN, True)
-                plan.hydra.overrides.task = [w for w in words if not parse(w).is_hydra_override()]
-                hydra.compose_config = lambda **_: plan
-                hydra.multirun("config", sweep, [])
-            finally:
-                are_finished = sweep.print_summary()
-            return 0 if are_finished else 1
+def main(words: Sequence[str] | None = None, program: str = "") -> int:
+    """Train, as ``python train.py`` does: the command ``safe-rl train``."""
+    start(_main, words)
     return 0

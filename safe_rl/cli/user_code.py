@@ -15,17 +15,26 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl import trust
-from safe_rl.cli.grammar import CommandLineError, overrides_of
 
 _imported: list[str] = []
 
 
-def note_imports(modules: str | Sequence[str] | None) -> list[str]:
-    """The override that writes modules into a run's configuration; an empty list for None."""
-    if modules is None:
-        return []
-    listed = list(modules) if isinstance(modules, list | tuple) else [modules]
-    return list(overrides_of({"++import": listed}))
+def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split words into the values of all ``name=value``, and the other words."""
+    given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
+    others = [word for word in words if word not in given]
+    return [word.partition("=")[2] for word in given], others
+
+
+def split_imports(words: Sequence[str]) -> tuple[list[str] | None, list[str]]:
+    """Separate ``import=``, which may be repeated or hold a list, from the other words.
+
+    Returns:
+        The modules, or None if ``import=`` is not given; and the other words.
+    """
+    given, others = take_word("import", words)
+    modules = [name.strip() for text in given for name in text.strip("[]").split(",")]
+    return (list(dict.fromkeys(filter(None, modules))) if given else None), others
 
 
 def import_modules(modules: str | Sequence[str] | None) -> None:
@@ -36,7 +45,7 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
             paths of files.
 
     Raises:
-        CommandLineError: If a module does not exist or cannot be imported, or if Python finds
+        ValueError: If a module does not exist or cannot be imported, or if Python finds
             another module of the same name.
     """
     for module in [modules] if isinstance(modules, str) else modules or ():
@@ -45,14 +54,14 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
             path = Path(module).expanduser()
             name = path.stem
             if not path.is_file():
-                raise CommandLineError(f"import={module}: there is no such file.")
+                raise ValueError(f"import={module}: there is no such file.")
         # the folder is added to the path: other processes import the module by its name
         folder = str(Path.cwd() if name == module else path.resolve().parent)
         if folder not in sys.path:
             sys.path.append(folder)
         found = _import(name, module)
         if path.is_file() and Path(found).resolve() != path.resolve():
-            raise CommandLineError(
+            raise ValueError(
                 f"import={module}: Python has another module of that name, {found}. Rename yours."
             )
         trust.allow(name)
@@ -72,7 +81,7 @@ def _import(name: str, given: str) -> str:
         return import_module(name).__file__ or ""
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
-            raise CommandLineError(
+            raise ValueError(
                 f"import={given}: there is no module '{error.name}' here or among the installed "
                 f"ones. A file is named by its path: import=folder/{error.name}.py."
             ) from None
@@ -80,9 +89,7 @@ def _import(name: str, given: str) -> str:
         # the user's own line, not the line of this package that refuses its arguments
         own = [frame for frame in frames if not _is_inner(frame.filename)]
         place = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
-        raise CommandLineError(
-            f"import={given}: {type(error).__name__}: {error}{place}."
-        ) from error
+        raise ValueError(f"import={given}: {type(error).__name__}: {error}{place}.") from error
 
 
 def _is_inner(file: str) -> bool:
@@ -101,7 +108,7 @@ def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, 
     noted = config.get("import") or []
     if given is None and noted:
         words = " ".join(f"import={module}" for module in noted)
-        raise CommandLineError(
+        raise ValueError(
             f"{run} was trained with {words}: add that to the command if you trust this code, or "
             f"'import=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
         )

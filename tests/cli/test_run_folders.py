@@ -59,11 +59,10 @@ def test_a_refused_run_changes_nothing_of_the_one_that_is_there(tmp_path):
         return {path: path.read_bytes() for path in files if path.name != ".lock"}
 
     before = contents()
-    assert run / ".hydra" / "overrides.yaml" in before
     refused = train(*SMALL, f"hydra.run.dir={run}", "frames=120", "seed=3")
     assert "already holds a run. Continue it with: python train.py resume=" in refused
     train(f"resume={run}", "frames=120", "policy_update.max_kl=abc")
-    assert "cannot change" in train(f"resume={run}", f"hydra.run.dir={tmp_path / 'other'}")
+    assert "in its folder" in train(f"resume={run}", f"hydra.run.dir={tmp_path / 'other'}")
     assert contents() == before
     # those that could not begin leave no folder
     crowded = train(*new, "env.hazards_num=200")

@@ -9,15 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import ROOT, SMALL, in_a_process
+from commands import ROOT, SMALL, composed, in_a_process
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import OmegaConf
-from registrations import undone
 
 from safe_rl.cli import session
-from safe_rl.cli.composing import resolving
-from safe_rl.cli.sweeps import Sweep, count_jobs
-from safe_rl.cli.train import read_command
+from safe_rl.cli.sweeps import Summary, run_in_sweep
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.display import LINE_SECONDS, ProgressBar
 from safe_rl.runs.outcome import final_figures
@@ -25,75 +23,61 @@ from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import read_table
 
 
-@pytest.mark.parametrize(
-    ("overrides", "number"),
-    [
-        (["env=PointGoal1", "seed=0"], 1),
-        (["env=PointGoal1,CarGoal1", "seed=0,10,20", "algo=ppo"], 6),
-        (["cost_limits={cost: 25, cost_hazards: 3}", "seed=range(5)"], 5),
-        (["frames=choice(10,20)", "model.hidden_sizes=[64,64],[32]"], 4),
-    ],
-)
-def test_jobs_are_counted_as_hydra_makes_them(overrides, number):
-    assert count_jobs(overrides) == number
-
-
-@pytest.mark.parametrize(("workers", "threads"), [(1, 8), (2, 4), (3, 2), (16, 2)])
+@pytest.mark.parametrize(("workers", "threads"), [(1, 8), (2, 4), (3, 2), (16, 1)])
 def test_jobs_at_a_time_share_the_cores(tmp_path, monkeypatch, workers, threads):
-    monkeypatch.setattr(pytest.importorskip("joblib"), "cpu_count", lambda: 8)
+    joblib = pytest.importorskip("joblib")
+    monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
     monkeypatch.setenv("SAFE_RL_NUM_THREADS", "1")
     monkeypatch.setenv(LINE_SECONDS, "1")
-    words = {"sweep": {"dir": tmp_path}, "launcher": {"n_jobs": workers}, "sweeper": {}}
-    Sweep(OmegaConf.create(words), ["seed=0,1,2,3"])
+    config = OmegaConf.create({"hydra": {"launcher": {"n_jobs": workers}}})
+    Summary(f"{tmp_path}/sweeps/first.jsonl").on_multirun_start(config)
     assert os.environ["SAFE_RL_NUM_THREADS"] == str(threads)
 
 
-@pytest.fixture
-def job(tmp_path, monkeypatch):
-    """Carries out a job of a sweep of three, which returns or raises what is given."""
+def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
+    summary = Summary(f"{tmp_path}/jobs.jsonl")
+    outcomes = {0: 3.5, 1: ValueError("no such cost\nmore"), 2: SystemExit(130)}
 
-    def node(number):
-        words = {"job": {"num": number}, "sweep": {"dir": str(tmp_path)}, "launcher": {}}
-        words |= {"sweeper": {}, "runtime": {"output_dir": str(tmp_path / f"seed{number}")}}
-        return OmegaConf.create(words)
+    def run_job(config, hydra):
+        outcome = outcomes[hydra.job.num]
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
 
-    def carry_out(number, outcome):
-        def run_job(config, hydra):
-            if isinstance(outcome, BaseException):
-                raise outcome
-            return outcome
+    def carry_out(number):
+        directory = tmp_path / f"seed{number}"
+        node = {"job": {"num": number}, "mode": "MULTIRUN", "runtime": {"choices": {}}}
+        node["runtime"]["output_dir"] = str(directory)
+        config = OmegaConf.create({"hydra": node})
+        config.hydra.mode = RunMode.MULTIRUN
+        summary.on_job_start(config)
+        made = OmegaConf.create({"env": {"name": "mine"}, "algo": {}})
+        run_in_sweep(made, config.hydra, directory)
+        summary.on_job_end(config)
 
-        monkeypatch.setattr(session, "run_job", run_job)
-        (tmp_path / f"seed{number}").mkdir(exist_ok=True)
-        # as where Hydra runs it
-        monkeypatch.setattr(
-            HydraConfig.instance(), "cfg", OmegaConf.create({"hydra": node(number)})
-        )
-        return carry_out.sweep(OmegaConf.create({}))
-
-    carry_out.sweep = Sweep(node(0), ["seed=0,1,2"])
-    return carry_out
-
-
-def test_a_failing_job_is_named_and_stops_nobody(job, tmp_path, capsys):
+    monkeypatch.setattr(session, "run_job", run_job)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")
-    assert job(0, 3.5) == 3.5
+    carry_out(0)
     assert not (tmp_path / "seed0" / "failure.txt").exists()
-    assert job(1, ValueError("no such cost\nmore")) == -math.inf
+    carry_out(1)
     with pytest.raises(SystemExit):
-        job(2, SystemExit(130))
-    assert not job.sweep.print_summary()
-    assert capsys.readouterr().out.splitlines() == [
+        carry_out(2)
+    with pytest.raises(SystemExit):
+        summary.on_multirun_end(None)
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [
         "Sweep: 1 of 3 runs are finished.",
-        f"  failed: {tmp_path}/seed1: ValueError: no such cost (see failure.txt there)",
+        f"  failed: {tmp_path}/seed1",
         f"  interrupted: {tmp_path}/seed2",
         "Start it again as it was: finished runs are skipped, the others continue.",
     ]
+    assert err == f"{tmp_path}/seed1: ValueError: no such cost more\n"
     assert "ValueError: no such cost\nmore" in (tmp_path / "seed1" / "failure.txt").read_text()
+    outcomes |= dict.fromkeys(outcomes, 0.0)
     for number in range(3):
-        job(number, 0.0)
-    assert job.sweep.print_summary()
+        carry_out(number)
+    summary.on_multirun_end(None)
     assert capsys.readouterr().out == "Sweep: 3 of 3 runs are finished.\n"
 
 
@@ -111,18 +95,19 @@ def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "between"),
     [
-        ([], ""),
-        (["num_threads=2", "logger=none", "record=true", "certificate.episodes=0"], ""),
-        (["import=examples/custom_environment.py", "env.mines_num=1"], "env.mines_num=1"),
-        (["slate=SGPoint", "frames=300_000,600_000", "preset=paper"], "frames=300000,preset=paper"),
+        ([], "."),
+        (["num_threads=2", "logger=none", "record=true", "certificate.episodes=0"], "."),
+        (["env.hazards_num=1", "import=json"], "env.hazards_num=1"),
     ],
 )
 def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
-    env = [] if any(word.startswith("slate=") for word in words) else ["env=PointGoal1"]
-    with undone():  # of the example's rows
-        config = read_command(["-m", *env, "algo=cpo,ppo", "seed=0,1", *words]).configs[0]
-    with resolving(config):
+    config = composed("env=PointGoal1", "algo=cpo", "seed=0", *words)[0]
+    before = HydraConfig.instance().cfg
+    HydraConfig.instance().set_config(config)
+    try:
         folder = Path(config.hydra.sweep.subdir)
+    finally:
+        HydraConfig.instance().cfg = before
     assert folder == Path("PointGoal1") / "cpo" / between / "seed0"
 
 
@@ -149,7 +134,6 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     assert sweep(tmp_path, *jobs, status=1).count("has its 120 frames already") == 2
     assert [table.stat().st_mtime_ns for table in tables] == before
     journals = sorted((tmp_path / "sweeps").iterdir())
-    assert len(journals) == 2
     notes = [json.loads(line) for line in journals[0].read_text().splitlines()]
     states = [state for _, state, _ in notes]
     assert sorted(states) == ["done"] * 2 + ["failed"] * 2 + ["interrupted"] * 4
@@ -220,9 +204,3 @@ def test_optuna_takes_the_return_within_the_limits(tmp_path):
     tables = [read_table(path) for path in tmp_path.rglob("progress.csv")]
     returns = [max(final_figures(table, ["cost"])["episode_return"] for table in tables)]
     assert best.best_value in (pytest.approx(returns[0]), -math.inf)
-
-
-def test_settings_of_the_launcher_are_known_without_choosing_it():
-    pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs the extra 'sweep'")
-    command = read_command(["-m", "env=PointGoal1", "seed=0,1", "hydra.launcher.n_jobs=2"])
-    assert command.configs[0].hydra.launcher.n_jobs == 2

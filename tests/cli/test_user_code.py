@@ -3,17 +3,15 @@
 import sys
 
 import pytest
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import point_mass_config
 
 from safe_rl import trust
 from safe_rl.cli import user_code
-from safe_rl.cli.composing import compose_resumed
-from safe_rl.cli.grammar import CommandLineError, split_imports
+from safe_rl.cli.resuming import read_resumed
 from safe_rl.cli.session import SETTING_ERRORS
-from safe_rl.cli.user_code import check_imports, import_modules, note_imports
+from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.envs import make_env
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
@@ -39,20 +37,11 @@ def folder(tmp_path, monkeypatch):
         del sys.modules[name]
 
 
-@pytest.mark.parametrize(
-    "modules", [["mine"], ["a", "b/c.py"], ["it's/a folder/x.py", "a,b=c/d.py"], []]
-)
-def test_a_noted_list_is_read_again(modules):
-    (noted,) = note_imports(modules)
-    override = OverridesParser.create().parse_overrides([noted])[0]
-    assert override.value() == modules
-    if not any("'" in module for module in modules):
-        assert split_imports([noted, "seed=1"]) == (modules, ["seed=1"])
-
-
-def test_a_list_that_cannot_be_read_is_told():
-    with pytest.raises(CommandLineError, match=r"'import=\[mine' cannot be read"):
-        split_imports(["import=[mine", "seed=1"])
+def test_modules_of_a_command_are_split_from_its_words():
+    words = ["import=[mine, b/c.py]", "seed=1", "import=mine", "import=it's/x.py"]
+    assert split_imports(words) == (["mine", "b/c.py", "it's/x.py"], ["seed=1"])
+    assert split_imports(["seed=1"]) == (None, ["seed=1"])
+    assert split_imports(["import=[]"]) == ([], [])
 
 
 def test_modules_are_found_by_name_and_by_file(folder):
@@ -88,7 +77,7 @@ def test_errors_are_one_line(folder, module, message):
     )
     (folder / "users_unread.py").write_text("x = (\n")
     (folder / "json.py").write_text("")
-    with pytest.raises(CommandLineError, match=message) as error:
+    with pytest.raises(ValueError, match=message) as error:
         import_modules([module])
     assert "\n" not in str(error.value)
 
@@ -106,8 +95,8 @@ def test_opening_a_run_imports_nothing(folder):
     (folder / "users_own.py").write_text(MODULE)
     loss = {"_target_": "users_own.Loss"}
     path = begun_run(folder / "run", **{"import": ["users_own"], "loss": loss})
-    with pytest.raises(CommandLineError, match=r"trained with import=users_own: add that"):
-        compose_resumed(folder / "run", [])
+    with pytest.raises(ValueError, match=r"trained with import=users_own: add that"):
+        read_resumed(folder / "run", None, [])
     config = OmegaConf.load(path)
     with pytest.raises(trust.TargetError, match=r"^loss\._target_=users_own\.Loss.*import=users"):
         build_trainer(config, PointMass(config.num_envs, 20), folder / "run")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from commands import composed
 from registrations import undone
 
 from safe_rl import trust
@@ -19,7 +20,6 @@ from safe_rl.cli import user_code
 from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.options import read_options
 from safe_rl.cli.report import ReportOptions
-from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
 from safe_rl.evaluation.variations import read_variations
@@ -112,7 +112,7 @@ def check(words: list[str], run: Path) -> None:
             if parsed.variations is not None and "my_" not in str(parsed.variations):
                 assert read_variations(parsed.variations)
         return
-    read_command(arguments)
+    composed(*arguments)
 
 
 def check_all(found: list[list[str]], run: Path, page: str) -> None:

@@ -8,14 +8,13 @@ import gymnasium_envs  # noqa: F401, registers Walk-v0
 import numpy as np
 import pytest
 import yaml
-from commands import run_train
+from commands import composed, run_train
 from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
 from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run
-from safe_rl.cli.train import read_command
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, read_variations, varied
 from safe_rl.files import CONF
@@ -165,7 +164,7 @@ def test_keys_of_sets_are_taken_by_training(name):
         transforms = {key.split(".")[1] for key in keys if key.startswith("transforms.")}
         chosen = [f"transforms=[{','.join(transforms)}]"] if transforms else []
         changes = [f"{key}={value}" for key, value in keys.items()]
-        read_command(["env=PointGoal1", *chosen, *changes])
+        composed("env=PointGoal1", *chosen, *changes)
 
 
 def test_what_concerns_elements_that_are_not_there_is_left_out():
