@@ -1,6 +1,11 @@
 """Data collection with cost accounting, and transitions on disk."""
 
-from safe_rl.collectors.accounting import EpisodeAccounting, EpisodeError, EpisodeStatistics
+from safe_rl.collectors.accounting import (
+    EpisodeAccounting,
+    EpisodeError,
+    EpisodeStatistics,
+    check_steps,
+)
 from safe_rl.collectors.datasets import (
     read_columns,
     read_dataset,
@@ -20,6 +25,7 @@ __all__ = [
     "StepRecorder",
     "WorkerCollector",
     "WorkerError",
+    "check_steps",
     "make_collector",
     "make_process_collector",
     "make_ray_collector",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -15,6 +16,52 @@ from safe_rl.resumable import Resumable
 
 class EpisodeError(ValueError):
     """Steps that break the rules of a constrained problem; the message says which."""
+
+
+def check_steps(entries: Mapping[NestedKey, Tensor], cost_keys: Sequence[NestedKey]) -> None:
+    """Refuse steps with NaN or infinite entries, or with costs below 0: nothing is learned of them.
+
+    The host reads one tensor from the device, unless something is wrong.
+
+    Args:
+        entries: Key -> entry [N, T, …]; only floating-point numbers are checked.
+        cost_keys: Those of the keys that are costs.
+
+    Raises:
+        FloatingPointError: If an entry is not finite; the message names entry, row and step.
+        EpisodeError: If a cost is below 0.
+
+    Examples:
+        >>> check_steps({"reward": torch.tensor([[0.0, torch.nan]])}, [])  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        FloatingPointError: 'reward' is not finite in 1 of 2 samples, first in environment 0 at ...
+    """
+    entries = {key: value for key, value in entries.items() if value.is_floating_point()}
+    if not entries:
+        return
+    sums = [value.sum(dtype=torch.float64) for value in entries.values()]
+    lowest = [entries[key].min().double() for key in cost_keys if key in entries]
+    read = torch.stack([*sums, *lowest]).tolist()
+    for key, total in zip(entries, read, strict=False):
+        if math.isfinite(total):
+            continue
+        value = entries[key]
+        wrong = ~value.reshape(*value.shape[:2], -1).isfinite().all(-1)
+        row, step = wrong.nonzero()[0].tolist()
+        where = f"environment {row}" + (f" at step {step}" if wrong.shape[1] > 1 else "")
+        raise FloatingPointError(
+            f"{key_name(key)!r} is not finite in {int(wrong.sum())} of {wrong.numel()} samples, "
+            f"first in {where}. Nothing has been learned from them: look for the environment's "
+            "first NaN or infinite number."
+        )
+    for key in cost_keys if min(read[len(sums) :], default=0.0) < 0 else ():
+        if below := int((entries[key] < 0).sum()):
+            raise EpisodeError(
+                f"The cost '{key_name(key)}' is below 0 in {below} of {entries[key].numel()} "
+                "steps. Costs must be 0 or more: clamp them in the environment, or add a constant "
+                "to the cost of every step, and this constant times the length of an episode to "
+                "the limit."
+            )
 
 
 @dataclass(frozen=True)
@@ -85,6 +132,11 @@ class EpisodeStatistics:
         return rows
 
 
+def _is_observed(key: NestedKey) -> bool:
+    names = (key,) if isinstance(key, str) else key
+    return names[names[0] == "next"] == "observation"
+
+
 class EpisodeAccounting(Resumable):
     """Sum rewards and costs over episodes that may span any number of batches.
 
@@ -105,6 +157,8 @@ class EpisodeAccounting(Resumable):
     Raises:
         KeyError: By :meth:`update`, if a key is not in the batch.
         EpisodeError: By :meth:`update`, if a cost is below 0, or an episode too long.
+        FloatingPointError: By :meth:`update`, if an observation, action, reward or cost is NaN or
+            infinite.
         ValueError: By :meth:`update`, if the batch does not have the shape [N, T], or [T] with
             N = 1, or an entry is not one number per step.
 
@@ -154,8 +208,12 @@ class EpisodeAccounting(Resumable):
                 f"The batch has shape {list(batch.shape)}, but the accounting is for {num_envs} "
                 f"environments: it needs [{num_envs}, T], as the collector returns it."
             )
-        signals = torch.stack([self._column(batch, key) for key in self._signal_keys], -1)
-        self._require_costs(signals[..., 1:])
+        columns = {key: self._column(batch, key) for key in self._signal_keys}
+        seen = {key: batch[key] for key in batch.keys(True, True) if _is_observed(key)}
+        # actions last: a policy that observes NaN acts with NaN
+        acted = {} if (action := batch.get("action", None)) is None else {"action": action}
+        check_steps({**seen, **columns, **acted}, self.cost_keys)
+        signals = torch.stack(list(columns.values()), -1)
         steps = torch.ones_like(signals[..., 0])
         if self.steps_per_decision != 1:
             steps = self._column(batch, STEPS_TAKEN)
@@ -190,17 +248,6 @@ class EpisodeAccounting(Resumable):
         last = num_done.view(-1, 1, 1).expand(-1, 1, num_sums)
         self.open_sums = sums.gather(1, last).squeeze(1)
         return sums[is_finished]
-
-    def _require_costs(self, costs: Tensor) -> None:
-        """Refuse costs [N, T, k] below 0; NaN is refused later, by the loss."""
-        for key, below in zip(self.cost_keys, (costs < 0).sum((0, 1)).tolist(), strict=True):
-            if below:
-                raise EpisodeError(
-                    f"The cost '{key_name(key)}' is below 0 in {below} of {costs[..., 0].numel()} "
-                    "steps, and nothing has been learned from them. Costs must be 0 or more: clamp "
-                    "them in the environment, or add a constant to the cost of every step, and "
-                    "this constant times the length of an episode to the limit."
-                )
 
     def _require_ends(self, lengths: Tensor) -> None:
         """Refuse episodes, finished with lengths [E] or unfinished, longer than `longest`."""

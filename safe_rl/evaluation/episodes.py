@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from safe_rl.collectors import check_steps
 from safe_rl.naming import STEPS_TAKEN
 
 
@@ -66,6 +67,10 @@ def collect_episodes(
         progress: Whether to show a bar.
         record: Function that gets every step [N], including those that do not count.
 
+    Raises:
+        FloatingPointError: If a reward or a cost is NaN or infinite.
+        EpisodeError: If a cost is below 0.
+
     Examples:
         >>> from safe_rl.envs import make_env
         >>> from safe_rl.models import BehaviourPolicy, make_actor
@@ -80,6 +85,7 @@ def collect_episodes(
     finished = torch.zeros(num_envs, dtype=torch.long)
     # float64: sums of indicator costs are exact
     sums = torch.zeros(num_envs, 2 + len(cost_keys), dtype=torch.float64)
+    lowest = torch.zeros(num_envs, 1 + len(cost_keys), dtype=torch.float64)
     rows: list[tuple[Tensor, Tensor]] = []  # world numbers [e], sums of their episodes [e, m]
     state = env.reset()
     with (
@@ -99,7 +105,12 @@ def collect_episodes(
             found = torch.cat(signals, -1).to(sums)
             done = found[:, 0].bool()
             sums += found[:, 1:]
+            # of single steps: the sum of an episode can hide one below 0
+            lowest = torch.minimum(lowest, found[:, 2:])
             if done.any():
+                steps = torch.where(sums[:, 1:].isfinite(), lowest, sums[:, 1:])
+                columns = zip((return_key, *cost_keys), steps.split(1, -1), strict=True)
+                check_steps(dict(columns), cost_keys)
                 counts = done & (finished < quota)
                 rows.append((counts.nonzero().squeeze(-1), sums[counts]))
                 finished += counts

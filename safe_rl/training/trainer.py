@@ -244,11 +244,10 @@ class Trainer:
             batch = next(batches)
             if self._snapshot is not None:
                 self._snapshot.take()
-        if self._recording is not None:
-            begun = self.accounting.have_begun
-            self._recording.write(self.progress.epoch, batch, begun=begun)
-        collected = time.perf_counter()
+        collected, begun = time.perf_counter(), self.accounting.have_begun
         episodes = self.accounting.update(batch)
+        if self._recording is not None:
+            self._recording.write(self.progress.epoch, batch, begun=begun)
         with fast_products():
             learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from point_mass import PointMass
 from tensordict import TensorDict
 
 from safe_rl.collectors import EpisodeAccounting, EpisodeError
@@ -147,7 +148,20 @@ def test_costs_below_0_are_refused_with_their_name():
     accounting = EpisodeAccounting(1, ["cost"])
     with pytest.raises(EpisodeError, match=r"'cost' is below 0 in 2 of 3 steps.*0 or more"):
         accounting.update(steps_of([-1.0, 0.0, -0.5], [False, False, True]))
-    accounting.update(steps_of([0.0, math.nan], [False, True]))
+    accounting.update(steps_of([0.0, 1.0], [False, True]))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    "key", ["observation", "action", ("next", "observation"), ("next", "reward"), ("next", "cost")]
+)
+def test_numbers_that_are_not_finite_are_refused_with_entry_and_row(key, number):
+    batch, accounting = PointMass(3).rollout(6), EpisodeAccounting(3, ["cost"])
+    batch[key][1, 4] = number
+    name = key if isinstance(key, str) else key[-1]
+    with pytest.raises(FloatingPointError, match=f"{name}' is not .* 1 of 18 .*ment 1 at step 4"):
+        accounting.update(batch)
+    assert not accounting.have_begun.any()
 
 
 @pytest.mark.parametrize("ends", [True, False])

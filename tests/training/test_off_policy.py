@@ -6,10 +6,12 @@ from functools import partial
 import pytest
 import torch
 from point_mass import Forgetful, PointMass
-from run_configs import assert_resumes_exactly, off_policy_config
+from run_configs import assert_resumes_exactly, compose_config, off_policy_config
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import RandomPolicy
 
 from safe_rl.algorithms import OffPolicy
+from safe_rl.collectors import EpisodeError
 from safe_rl.evaluation.episodes import collect_episodes, periodic_evaluation
 from safe_rl.evaluation.loading import load_policy
 from safe_rl.objectives import SACLagrangianLoss
@@ -290,3 +292,39 @@ def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
     table = read_table(tmp_path / "progress.csv")
     assert sum(table["episode_return"][-20:]) / 20 > 0.9
     assert sum(table["episode_cost"][-20:]) / 20 < 1.5
+
+
+class Broken(PointMass):
+    """Gives one wrong number in the third step of its first row."""
+
+    key, number = "cost", torch.nan
+
+    def _step(self, tensordict):
+        step = super()._step(tensordict)
+        step[self.key][0] = torch.where(self._step_count[0] == 3, self.number, step[self.key][0])
+        return step
+
+
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian", "sac", "ppo_lagrangian"])
+@pytest.mark.parametrize("key", ["cost", "reward", "observation"])
+def test_a_wrong_number_is_refused_in_the_batch_in_which_it_arrives(algo, key, tmp_path):
+    config = (off_policy_config if algo != "ppo_lagrangian" else compose_config)(
+        "env=PointMass", f"algo={algo}", "num_envs=4", "frames_per_batch=160", "logger=none"
+    )
+    env = Broken(4, 20)
+    env.key = key
+    trainer = build_trainer(config, env, tmp_path)
+    with pytest.raises(FloatingPointError, match=rf"{key}' is not finite .* environment 0 at st"):
+        trainer.run()
+    assert not len(getattr(trainer.algorithm, "replay_buffer", ()))
+
+
+def test_costs_below_0_are_refused_where_policies_are_evaluated():
+    """Also if the sum of the episode is above 0."""
+    env = Broken(2, 20)
+    env.number = -0.5
+    with pytest.raises(EpisodeError, match="'cost' is below 0"):
+        collect_episodes(env, RandomPolicy(env.action_spec), 2, ["cost"], deterministic=False)
+    env.number = torch.inf
+    with pytest.raises(FloatingPointError, match="'cost' is not finite in 1 of 2"):
+        collect_episodes(env, RandomPolicy(env.action_spec), 2, ["cost"], deterministic=False)

@@ -227,14 +227,15 @@ def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path)
         ("bc", ("next", "cost"), torch.nan),
         ("bc", "action", torch.inf),
         ("sac_lagrangian", ("next", "reward"), torch.nan),
+        ("bc", ("next", "cost"), -1.0),
     ],
 )
-def test_numbers_that_are_not_finite_are_refused(algo, key, value, tmp_path):
+def test_wrong_numbers_are_refused(algo, key, value, tmp_path):
     batch = PointMass(2, 20).rollout(20)
     batch[key][1, 3:5] = value
     Recording(tmp_path / "data", PointMass.cost_keys).write(0, batch)
     name = key if isinstance(key, str) else key[1]
-    with pytest.raises(ValueError, match=f"the {name} of 2 transitions is not finite"):
+    with pytest.raises(ValueError, match=f"{name}' is (not finite|below 0) in 2 of 40"):
         OffPolicy.from_config(
             offline_config(tmp_path / "data", limits="{cost: 25}", algo=algo), PointMass(2)
         )
