@@ -79,7 +79,8 @@ class OffPolicy(Resumable, Algorithm):
         """
         limits = constrained_limits(config, env, otherwise="sac")
         device = torch.device(config.device)
-        networks = build_networks(config, env, len(limits), device)
+        cost_values = instantiate(config.critics.get("cost_values"))
+        networks = build_networks(config, env, len(limits), device, cost_values)
         constraints = build_constraints(config, limits, env, device)
         multiplier = build_multiplier(config, limits, device)
         loss = instantiate(
@@ -90,6 +91,7 @@ class OffPolicy(Resumable, Algorithm):
                 "action_spec": bounded_actions(env).to(device),
                 "multiplier": multiplier,
                 "cost_keys": constraints.keys,
+                "cost_values": cost_values,
                 "cost_limits": limits,
             },
             actor_network=networks["actor"],

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
 from safe_rl.models.encoders import TO_FLATTEN, observed_entries
+from safe_rl.objectives import CostValues, MeanCosts
 from safe_rl.trust import instantiate
 
 _ON_POLICY_ONLY = ("_target_", "encoders", "memory", "normalise")
@@ -45,7 +46,11 @@ def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> Explor
 
 
 def build_networks(
-    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+    config: DictConfig,
+    env: EnvBase,
+    num_costs: int,
+    device: torch.device,
+    cost_values: CostValues | None = None,
 ) -> dict[str, Any]:
     """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
 
@@ -54,12 +59,14 @@ def build_networks(
         env: Environment whose specs have the sizes of observations and actions.
         num_costs: Number of constrained costs; 0: no cost critics.
         device: Device of the parameters.
+        cost_values: What the cost critics return; by default the mean.
 
     Raises:
         ValueError: If actions have no bounds, the observation is not a vector, or the model is for
             on-policy algorithms only.
     """
     model, spec = config.model, bounded_actions(env)
+    cost_values = MeanCosts() if cost_values is None else cost_values
     size, actions = _observation_size(config, env), len(spec.low)
     common: dict[str, Any] = {
         "hidden_sizes": list(model.hidden_sizes),
@@ -71,8 +78,14 @@ def build_networks(
     if number := config.critics.rewards:
         networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
     if num_costs and (number := config.critics.costs):
-        common |= {"num_outputs": num_costs, "out_key": "cost_state_action_value"}
-        networks["cost_critic"] = QEnsemble(size, actions, num_networks=number, **common)
+        networks["cost_critic"] = QEnsemble(
+            size,
+            actions,
+            num_networks=number * cost_values.networks,
+            num_outputs=num_costs * cost_values.outputs,
+            out_key="cost_state_action_value",
+            **common,
+        )
     return networks
 
 

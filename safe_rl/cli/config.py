@@ -93,10 +93,12 @@ class Critics:
     Attributes:
         rewards: Number of Q functions of the reward.
         costs: Number of Q functions of the costs.
+        cost_values: What a Q function of the costs returns; null: the mean.
     """
 
     rewards: Annotated[int, Interval(ge=0, le=1000)]
     costs: Annotated[int, Interval(ge=0, le=1000)]
+    cost_values: Any = None
 
 
 @dataclass

@@ -7,13 +7,14 @@ from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.cal import CALLoss
 from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
+from safe_rl.objectives.cost_values import CostValues, GaussianCosts, MeanCosts, QuantileCosts
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.deterministic_losses import BCLoss, TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier, ProjectedMultiplier
-from safe_rl.objectives.penalties import IPOLoss, P3OLoss
+from safe_rl.objectives.penalties import APPOLoss, IPOLoss, P3OLoss
 from safe_rl.objectives.policy_losses import (
     CPOLoss,
     PPOLagrangianLoss,
@@ -26,9 +27,9 @@ from safe_rl.objectives.policy_projections import CUPLoss, FOCOPSLoss
 from safe_rl.objectives.risk import Chance, CVaR, RiskMeasure
 from safe_rl.objectives.sac import SACLagrangianLoss, SACLoss
 from safe_rl.objectives.surrogate import SurrogateLoss
-from safe_rl.objectives.wcsac import WCSACLoss
 
 __all__ = [
+    "APPOLoss",
     "ActorCriticLoss",
     "BCLoss",
     "CALLoss",
@@ -37,13 +38,16 @@ __all__ = [
     "CVaR",
     "Chance",
     "CostGAE",
+    "CostValues",
     "CriticLoss",
     "FOCOPSLoss",
+    "GaussianCosts",
     "IPOLoss",
     "JointAdvantages",
     "LagrangeMultiplier",
     "LimitState",
     "LimitTracker",
+    "MeanCosts",
     "Multiplier",
     "P3OLoss",
     "PIDMultiplier",
@@ -51,6 +55,7 @@ __all__ = [
     "PPOLagrangianLoss",
     "PPOLoss",
     "ProjectedMultiplier",
+    "QuantileCosts",
     "RCPOLoss",
     "RiskMeasure",
     "SACLagrangianLoss",
@@ -61,6 +66,5 @@ __all__ = [
     "TRPOLagrangianLoss",
     "TRPOLoss",
     "VectorGAE",
-    "WCSACLoss",
     "normalise_advantages",
 ]

@@ -75,7 +75,7 @@ class CALLoss(SACLagrangianLoss):
         ...     actor, q, cost_q, multiplier=multiplier, cost_keys=["cost"], **settings
         ... )
         >>> _ = loss.discounted_limit.fill_(2.5)
-        >>> values = torch.full((4, 6, 1), 2.7)  # of four networks for six actions
+        >>> values = torch.full((1, 4, 6, 1), 2.7)  # of four networks for six actions
         >>> loss.cost_weights(values)  # 1 + 10 (2.7 - 2.5)
         tensor([3.0000])
     """
@@ -105,7 +105,7 @@ class CALLoss(SACLagrangianLoss):
 
     def cost_weights(self, values: Tensor) -> Tensor:
         """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `prepare`."""
-        means = values.flatten(0, -2).mean(0).to(self.predicted_costs)
+        means = self.cost_values.mean(values).flatten(0, -2).mean(0).to(self.predicted_costs)
         self.predicted_costs.add_(torch.stack([means, torch.ones_like(means)]))
         expected = self.cost_of(values).flatten(0, -2).mean(0)
         excess = (expected - self.discounted_limit) / self.cost_unit

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from pydantic import FiniteFloat
 from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives.utils import distance_loss
 
+from safe_rl.objectives.cost_values import CostValues, MeanCosts
 from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.multipliers import Multiplier
@@ -35,10 +35,12 @@ class CostCritics(QFunctionLoss):
 
     Args:
         actor_network, qvalue_network: Networks of the loss without costs.
-        cost_qvalue_network: A `safe_rl.models.QEnsemble` with one output per cost.
+        cost_qvalue_network: A `safe_rl.models.QEnsemble` of E critics, whose outputs are what
+            `cost_values` says; by default one per cost.
         multiplier: λ; read at every call. It is not part of the loss or its ``state_dict``.
         cost_keys: Keys of the costs below ``next``, [..., 1] each. Transitions over n steps need
             discounted sums of costs: name the costs in ``reward_keys`` of `MultiStepTransform`.
+        cost_values: What the outputs of a critic mean; by default `MeanCosts`.
         pessimism: Number κ of standard deviations among the cost critics that is added to their
             mean in the actor's loss.
         target_pessimism: Number κ' of standard deviations among the cost critics that is added to
@@ -74,6 +76,7 @@ class CostCritics(QFunctionLoss):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
+        cost_values: CostValues | None = None,
         pessimism: FiniteFloat = 0.0,
         target_pessimism: FiniteFloat | None = None,
         lowest_cost_value: FiniteFloat | None = None,
@@ -81,6 +84,13 @@ class CostCritics(QFunctionLoss):
     ) -> None:
         device = next(cost_qvalue_network.parameters()).device
         check_ensemble(cost_qvalue_network, "cost critic")
+        self.cost_values = MeanCosts() if cost_values is None else cost_values
+        self.risk_measure = self.cost_values.risk_measure
+        if (number := cost_qvalue_network.num_networks) % self.cost_values.networks:
+            raise ValueError(
+                f"There are {number} networks of cost critics, and "
+                f"{type(self.cost_values).__name__} takes {self.cost_values.networks} for each one."
+            )
         self.cost_keys = list(cost_keys)  # the base's constructor makes in_keys of them
         if multiplier.num_costs != len(self.cost_keys):
             raise ValueError(f"{multiplier.num_costs} multipliers for the costs {self.cost_keys}.")
@@ -88,7 +98,9 @@ class CostCritics(QFunctionLoss):
         self.convert_to_functional(
             cost_qvalue_network, "cost_qvalue_network", create_target_params=True
         )
-        self.out_keys = [*self.out_keys, "loss_cost_qvalue", "cost_qvalue"]
+        self.out_keys = [
+            *self.out_keys, "loss_cost_qvalue", "cost_qvalue", *self.cost_values.columns
+        ]  # fmt: skip
         self.pessimism, self.target_pessimism = pessimism, target_pessimism
         self.lowest_cost_value = lowest_cost_value
         # not a part of the loss: its owner saves it
@@ -102,9 +114,15 @@ class CostCritics(QFunctionLoss):
         super()._set_in_keys()
         self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
 
-    def expected(self, values: Tensor) -> Tensor:
-        """Expected discounted costs of actions, [..., k], from critics' outputs [E, ..., k]."""
-        return values.mean(0)
+    def values_of_costs(
+        self,
+        steps: TensorDictBase,
+        action: Tensor,
+        kind: Literal["own", "target", "frozen"] = "own",
+    ) -> Tensor:
+        """Numbers of the E critics for actions, [n, E, ..., k]; arguments as of `q_values`."""
+        outputs = self.q_values(_COSTS, steps, action, kind)
+        return self.cost_values.arranged(outputs, len(self.cost_keys))
 
     @torch.no_grad()
     def cost_bias(self, batch: TensorDictBase) -> Tensor:
@@ -112,10 +130,10 @@ class CostCritics(QFunctionLoss):
         keys = self.tensor_keys
         steps = batch.select(*self.in_keys, ("next", keys.done), strict=False)
         steps = steps.to(self.cost_unit.device)
-        values = self.q_values(_COSTS, steps, steps.get(keys.action))
+        values = self.values_of_costs(steps, steps.get(keys.action))
         costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
         ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
-        return critic_bias(self.expected(values), costs, *ends, self.gamma)
+        return critic_bias(self.cost_values.mean(values).mean(0), costs, *ends, self.gamma)
 
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
@@ -135,33 +153,23 @@ class CostCritics(QFunctionLoss):
         following = tensordict.get("next")
         costs = torch.cat([self.column(tensordict, key) for key in self.cost_keys], -1)
         with torch.no_grad():
-            values = self.q_values(_COSTS, following, next_action, "target")
+            values = self.values_of_costs(following, next_action, "target")
             ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
-        outputs = self.q_values(_COSTS, tensordict, tensordict.get(self.tensor_keys.action))
-        loss = self.cost_errors(outputs, costs, discount, values).sum(-1).sum(0)
+        found = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
+        loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
         return self._mean(loss, tensordict)
 
     def cost_errors(
-        self, outputs: Tensor, costs: Tensor, discount: Tensor, following: Tensor
+        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor
     ) -> Tensor:
-        """Distance of the critics from their TD(0) targets, for every step.
-
-        Args:
-            outputs: Outputs of the networks, [E, ..., k].
-            costs: Costs of the steps, [..., k].
-            discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
-            following: Outputs of the target networks in the next state, [E, ..., k].
-
-        Returns:
-            The distances, [E, ..., k].
-        """
-        target = costs + discount * self.bounded(following)
-        return distance_loss(outputs, target, loss_function=self.loss_function)
+        """Distances of the critics from their TD(0) targets, [E, ..., k]; see `CostValues`."""
+        given = values, costs, discount, following
+        return self.cost_values.errors(*given, self.bounded, self.loss_function)
 
     def bounded(self, values: Tensor) -> Tensor:
-        """Values to bootstrap on, from outputs [E, ..., k] of the target networks."""
+        """Costs to bootstrap on, from those of the E target networks, [E, ...]."""
         if self.target_pessimism is not None:
             values = pessimistic(values, self.target_pessimism).expand_as(values)
         lowest = self.lowest_cost_value
@@ -176,8 +184,8 @@ class CostCritics(QFunctionLoss):
                 f"{type(self).__name__} does not know the scales of costs and rewards: call "
                 "prepare(batch, limits) with every batch, before its updates."
             )
-        values = self.q_values(_COSTS, tensordict, action, "frozen")
-        samples = self.of_samples(values.detach(), tensordict)
+        values = self.values_of_costs(tensordict, action, "frozen")
+        samples = self.of_samples(values.detach(), tensordict, first=2)
         weights = self.cost_weights(samples).to(values)
         penalty = self.reward_unit * (self.cost_of(values) @ weights)
         objective = (objective + penalty) / (1 + weights.sum())
@@ -185,16 +193,17 @@ class CostCritics(QFunctionLoss):
         return objective, {name: x for name, x in reported.items() if name in self.out_keys}
 
     def cost_of(self, values: Tensor) -> Tensor:
-        """Costs of actions as the actor's loss has them, [..., k], from outputs [E, ..., k]."""
-        return pessimistic(values, self.pessimism)
+        """Costs of actions as the actor's loss has them, [..., k], from [n, E, ..., k]."""
+        return pessimistic(self.cost_values.cost(values), self.pessimism)
 
     def cost_weights(self, values: Tensor) -> Tensor:
         """Weights of the costs in the actor's loss, [k]: λ / u."""
         return self.multiplier.value.to(self.cost_unit) / self.cost_unit
 
     def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
-        """Diagnostics of outputs [E, ..., k] of the cost critics, [k] each."""
-        return {"cost_qvalue": values.flatten(0, -2).mean(0)}
+        """Diagnostics of the critics' numbers [n, E, ..., k], [k] each."""
+        figures = {"cost_qvalue": self.cost_values.mean(values), **self.cost_values.figures(values)}
+        return {name: each.flatten(0, -2).mean(0) for name, each in figures.items()}
 
 
 def pessimistic(values: Tensor, deviations: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""Clipped policy losses with a penalty on costs: P3O's exact penalty and IPO's barrier."""
+"""Clipped policy losses with a penalty on costs: exact (P3O), barrier (IPO), quadratic (APPO)."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
-from pydantic import NonNegativeFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
 
-from safe_rl.objectives.limit_state import LimitState
 from safe_rl.objectives.policy_losses import PPOLoss, clipped_gain
+from safe_rl.objectives.surrogate import WeighsCosts
 
 
 class PenaltyLoss(PPOLoss):
@@ -23,14 +23,6 @@ class PenaltyLoss(PPOLoss):
     """
 
     has_costs = True
-
-    def _state(self) -> LimitState:
-        if self.limits is None:
-            raise ValueError(
-                f"{type(self).__name__} has no state of the limits yet: call "
-                "prepare(batch, limits) with every batch, before its first step."
-            )
-        return self.limits
 
 
 class P3OLoss(PenaltyLoss):
@@ -87,7 +79,7 @@ class P3OLoss(PenaltyLoss):
         surrogates = self._cost_surrogates(tensordict, gain)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_penalty": self.kappa * self._state().excess(surrogates).relu().sum(),
+            "loss_penalty": self.kappa * self._known_limits().excess(surrogates).relu().sum(),
             "cost_surrogate": surrogates.detach(),
         }
 
@@ -155,11 +147,80 @@ class IPOLoss(PenaltyLoss):
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)
         # before the first batch T̄ is not known
-        kappa = (self.kappa / self._state().length.to(surrogates)).nan_to_num(self.kappa)
+        kappa = (self.kappa / self._known_limits().length.to(surrogates)).nan_to_num(self.kappa)
         return {
             **super()._surrogates(tensordict, log_weight),
             "loss_barrier": log_barrier(
-                -self._state().excess(surrogates), kappa, self.max_weight
+                -self._known_limits().excess(surrogates), kappa, self.max_weight
             ).sum(),
             "cost_surrogate": surrogates.detach(),
         }
+
+
+class APPOLoss(WeighsCosts, PPOLoss):
+    """PPO on an augmented Lagrangian: a quadratic penalty on the predicted violation, and λ.
+
+    Dai, Ji, Yang, Zheng, Pan, *Augmented Proximal Policy Optimization for Safe Reinforcement
+    Learning* (AAAI 2023), with the penalty of Nocedal and Wright (2006, section 17.4) for
+    inequalities: minimises
+
+        (E[−min(ρA, clip(ρ)A)] + Σᵢ (s/uT̄)ᵢ (max(0, λᵢ + σΔᵢ)² − λᵢ²) / 2σ) / (1 + Σᵢ λᵢ),
+        Δᵢ = (J_cᵢ − dᵢ + T̄ E[max(ρA_cᵢ, clip(ρ)A_cᵢ)]) / sᵢ,
+
+    where Δ is the violation that the update itself predicts, in units of s (`LimitState.scale`),
+    and u is the size of one cost. So the weight of a cost is max(0, λ + σΔ) / u: it falls while the
+    update lowers the cost, and is 0 for a policy that is far enough below its limit.
+
+    Reports ``loss_penalty``, ``clip_fraction``, the detached ``cost_surrogate`` [k] and
+    ``cost_weight`` [k], max(0, λ + σΔ).
+
+    Args:
+        parts: Actor, and a multiplier with one λ per column of ``cost_advantage``.
+        sigma: Penalty coefficient σ: increase of a weight per predicted violation of the size s.
+        settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import make_actor
+        >>> from safe_rl.objectives import LimitState, PIMultiplier
+        >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
+        >>> gains = {"init": 0.5, "kp": 0.0, "ki": 0.1, "saturation": 0.5, "highest": 5.0}
+        >>> multiplier = PIMultiplier({"cost": 25.0}, **gains)
+        >>> loss = APPOLoss(actor, multiplier, sigma=2.0, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> with torch.no_grad():
+        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
+        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.zeros(8, 1)
+        >>> state = LimitState.of(cost=[30.0], limit=[25.0], length=1000.0)
+        >>> loss(loss.prepare(batch, state))["cost_weight"]  # 0.5 + 2 · 5 / 25
+        tensor([0.9000])
+    """
+
+    extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate", "cost_weight")
+
+    def __init__(self, *parts: Any, sigma: PositiveFloat, **settings: Any) -> None:
+        super().__init__(*parts, **settings)
+        self.sigma = sigma
+
+    def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
+        state = self._known_limits()
+        gain = -clipped_gain(log_weight, -self._cost_advantage(tensordict), self.clip_epsilon)
+        scale, unit, length = (x.to(gain) for x in (state.scale, state.unit, state.length))
+        surrogates = unit * self._cost_surrogates(tensordict, gain)
+        violation = state.excess(surrogates) * length / scale
+        multiplier = self.multiplier.value.to(gain)
+        weight = (multiplier + self.sigma * violation).clamp_min(0)
+        penalty = (weight.square() - multiplier.square()) / (2 * self.sigma)
+        penalty = penalty * scale / (unit * length)
+        divisor = 1 + multiplier.sum()
+        losses = super()._surrogates(tensordict, log_weight)
+        return {
+            **losses,
+            "loss_objective": losses["loss_objective"] / divisor,
+            "loss_penalty": penalty.sum() / divisor,
+            "cost_surrogate": surrogates.detach(),
+            "cost_weight": weight.detach(),
+        }
+
+    def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
+        return reward_gain  # the costs are in the penalty

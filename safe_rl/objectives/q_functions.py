@@ -163,10 +163,13 @@ class QFunctionLoss(ReplayLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         return self._reduce_loss(losses, tensordict=tensordict, weights=weights)
 
-    def of_samples(self, values: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Outputs [E, ..., n] of an ensemble for the steps [...] that are not padding."""
+    def of_samples(self, values: Tensor, tensordict: TensorDictBase, first: int = 1) -> Tensor:
+        """Outputs [E, ..., n] of an ensemble for the steps [...] that are not padding.
+
+        `first` is the number of dimensions before those of the steps.
+        """
         mask = sample_mask(tensordict, self)
-        return values if mask is None else values[:, mask]
+        return values if mask is None else values[(slice(None),) * first + (mask,)]
 
     def q_values(
         self,

@@ -148,6 +148,14 @@ class SurrogateLoss(Checked, SharesTensors):
         self.limits = limits
         return batch
 
+    def _known_limits(self) -> LimitState:
+        if self.limits is None:
+            raise ValueError(
+                f"{type(self).__name__} has no state of the limits yet: call "
+                "prepare(batch, limits) with every batch, before its first step."
+            )
+        return self.limits
+
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
         """Key of each parameter of the behaviour policy in the batch, by the actor's key.

@@ -9,6 +9,7 @@ from tabular import ONE_OF_THREE, TWO_COMPONENTS
 
 from safe_rl.algorithms import CPOStep, CRPOStep, CTRPOStep, PCPOStep, TRPOStep
 from safe_rl.objectives import (
+    APPOLoss,
     CPOLoss,
     CUPLoss,
     FOCOPSLoss,
@@ -17,6 +18,7 @@ from safe_rl.objectives import (
     LimitState,
     P3OLoss,
     PIDMultiplier,
+    PIMultiplier,
     PPOLagrangianLoss,
     PPOLoss,
     ProjectedMultiplier,
@@ -126,6 +128,18 @@ def p3o(actor, cmdp):
     return lambda batch, mean_costs: update(batch, state_of(cmdp, mean_costs))
 
 
+def appo(actor, cmdp):
+    gains = {"init": 0.0, "kp": 0.0, "ki": 0.3, "saturation": 1.0, "highest": 10.0}
+    multiplier = PIMultiplier(cmdp.cost_limits, **gains)
+    update = ppo_update(APPOLoss(actor, multiplier, sigma=2.0, **PPO), actor)
+
+    def update_both(batch, mean_costs):
+        multiplier.update(state := state_of(cmdp, mean_costs))
+        update(batch, state)
+
+    return update_both
+
+
 def ipo(actor, cmdp):
     loss = IPOLoss(actor, kappa=0.01 * STEPS, max_weight=10.0, **PPO)
     update = ppo_update(loss, actor)
@@ -187,6 +201,7 @@ CONSTRAINED = [
     (trpo_pid, 120),
     (cpo, 100),
     (p3o, 120),
+    (appo, 120),
     (ipo, 120),
     (weighed(FOCOPSLoss, temperature=1.5, max_state_kl=TARGET_KL, entropy_coeff=0.0), 250),
     (weighed(RCPOLoss, **PPO), 250),

@@ -86,7 +86,7 @@ def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
 
 def test_costs_are_free_until_the_limit_is_known():
     loss = make_loss()
-    assert not loss.cost_weights(torch.rand(4, 6, 2)).any()
+    assert not loss.cost_weights(torch.rand(1, 4, 6, 2)).any()
 
 
 def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
@@ -98,10 +98,10 @@ def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
     assert loss.cost_unit.tolist() == [1.0, 2.0]
     for _ in range(3):
         for _ in range(4):
-            loss.cost_weights(torch.tensor([3.5, 0.56]).expand(4, 6, 2))
+            loss.cost_weights(torch.tensor([3.5, 0.56]).expand(1, 4, 6, 2))
         prepare(loss, [50.0, 8.0])
     torch.testing.assert_close(loss.discounted_limit, torch.tensor([1.75, 0.7]))
-    weights = loss.cost_weights(torch.tensor([1.8, 0.65]).expand(4, 6, 2))
+    weights = loss.cost_weights(torch.tensor([1.8, 0.65]).expand(1, 4, 6, 2))
     torch.testing.assert_close(weights, torch.tensor([1.5, 0.5]))
 
 
@@ -110,7 +110,7 @@ def test_the_limit_follows_what_batches_say_and_not_too_far():
     rows = [([40.0, 0.0], (1.0, 9.0)), ([20.0, 0.0], (4.0, 9.0)), ([60.0, 0.0], (30.0, 9.0))]
     said = spent = 0.0
     for costs, values in rows:
-        loss.cost_weights(torch.tensor(values).expand(4, 6, 2))
+        loss.cost_weights(torch.tensor(values).expand(1, 4, 6, 2))
         prepare(loss, costs)
         said, spent = 0.75 * said + 0.25 * values[0], 0.75 * spent + 0.25 * costs[0]
         ratio = min(max(said / spent, 0.05), 0.2)  # one below, one within, one above

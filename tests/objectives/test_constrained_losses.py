@@ -16,10 +16,12 @@ from scipy.optimize import linprog
 from tensordict import TensorDict
 
 from safe_rl.objectives import (
+    APPOLoss,
     CostGAE,
     CPOLoss,
     FOCOPSLoss,
     IPOLoss,
+    LimitState,
     P3OLoss,
     PPOLagrangianLoss,
     PPOLoss,
@@ -34,9 +36,9 @@ CLIP = {"clip_epsilon": 0.2, "entropy_coeff": 0.01}
 FREE = {"clip_epsilon": 1.0, "entropy_coeff": 0.0}
 
 
-def told(loss, *violation, length=100.0):
+def told(loss, *violation, **known):
     """The loss, which knows the state of the limits."""
-    loss.prepare(TensorDict(), limit_state(*violation, length=length))
+    loss.prepare(TensorDict(), limit_state(*violation, **known))
     return loss
 
 
@@ -48,6 +50,9 @@ def projected(*values):
 LOSSES = {
     "p3o": lambda actor: told(P3OLoss(actor, kappa=3.0, **CLIP), 60.0, -90.0),
     "ipo": lambda actor: told(IPOLoss(actor, kappa=10.0, max_weight=2.0, **CLIP), -200.0, 30.0),
+    "appo": lambda actor: told(
+        APPOLoss(actor, projected(0.5, 2.0), sigma=3.0, **CLIP), 0.2, -0.3, unit=[1.0, 2.0]
+    ),
     "divergence": lambda actor: FOCOPSLoss(
         actor, projected(0.5, 2.0), temperature=1.5, max_state_kl=0.05, entropy_coeff=0.01
     ),
@@ -123,6 +128,24 @@ def test_p3o_clips_costs_to_their_pessimistic_side():
     losses = told(P3OLoss(actor, kappa=20.0, **CLIP), 2.5)(batch)
     assert losses["cost_surrogate"].item() == pytest.approx(expected, abs=1e-6)
     assert losses["loss_penalty"].item() == pytest.approx(20 * max(expected + 0.025, 0), abs=1e-5)
+
+
+@pytest.mark.parametrize("violation", [2.0, -2.0])
+def test_appo_has_the_gradient_of_the_augmented_lagrangian(violation):
+    """max(0, λ + σΔ)² / 2σ with Δ the violation after the update, in units of the scale."""
+    actor, logits, batch = one_state(GAIN, COST)
+    multiplier = ProjectedMultiplier([25.0], init=0.5, lr=0.01, highest=None)
+    loss = APPOLoss(actor, multiplier, sigma=3.0, **FREE)
+    loss.clip_epsilon.fill_(1e6)
+    state = LimitState.of(cost=[10.0 + violation], limit=[10.0], length=20.0)
+    losses = loss(loss.prepare(batch, state))
+    found = torch.autograd.grad(losses["loss_objective"] + losses["loss_penalty"], logits)[0]
+    policy = logits.softmax(0)
+    change = (violation + 20 * (policy @ torch.tensor(COST) - sum(COST) / 3)) / 10
+    inner = (0.5 + 3 * change).clamp_min(0)
+    value = -policy @ torch.tensor(GAIN) + 10 / 20 * inner.square() / 6
+    torch.testing.assert_close(found, torch.autograd.grad(value / 1.5, logits)[0])
+    torch.testing.assert_close(losses["cost_weight"], inner.detach()[None])
 
 
 @pytest.mark.parametrize("kappa", [0.05, 0.2])

@@ -1,4 +1,4 @@
-"""The worst-case soft actor-critic against closed forms, sampled returns and finite differences."""
+"""Critics of Gaussian and quantile costs against closed forms, samples and finite differences."""
 
 import numpy as np
 import pytest
@@ -9,23 +9,24 @@ from tensordict import TensorDict
 from torchrl.data import Bounded
 
 from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import LagrangeMultiplier, WCSACLoss
-from safe_rl.objectives.wcsac import gaussian_tail
+from safe_rl.objectives import GaussianCosts, LagrangeMultiplier, QuantileCosts, SACLagrangianLoss
+from safe_rl.objectives.cost_values import gaussian_tail
 
 BOUNDS = -torch.ones(2), torch.ones(2)
 SETTINGS = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": Bounded(-1, 1, [2])}
 
 
-def make_loss(observed=3, hidden=(8,), kind=WCSACLoss, networks=2, costs=("cost",), **keys):
-    keys = {"tail": 0.3, **keys} if kind is WCSACLoss else keys
+def make_loss(observed=3, hidden=(8,), networks=2, costs=("cost",), values=None, **keys):
+    values = GaussianCosts(tail=0.3) if values is None else values
+    outputs = {"num_outputs": len(costs) * values.outputs, "out_key": "costs"}
     q = [
         QEnsemble(observed, 2, hidden_sizes=hidden, num_networks=number, **more)
-        for number, more in ((2, {}), (networks, {"num_outputs": len(costs), "out_key": "costs"}))
+        for number, more in ((2, {}), (networks, outputs))
     ]
     multiplier = LagrangeMultiplier(dict.fromkeys(costs, 25.0), init=2.0, lr=0.05)
-    loss = kind(
+    loss = SACLagrangianLoss(
         make_squashed_actor(observed, *BOUNDS, hidden_sizes=[8]), *q,
-        multiplier=multiplier, cost_keys=costs, **SETTINGS, **keys,
+        multiplier=multiplier, cost_keys=costs, cost_values=values, **SETTINGS, **keys,
     )  # fmt: skip
     nothing = TensorDict({"next": {"reward": torch.empty(0, 1)}}, [0])
     loss.prepare(nothing, limit_state(*[0.0] * len(costs)))
@@ -73,8 +74,8 @@ def test_a_chain_is_learned_to_the_mean_and_variance_of_its_gaussian_return(end)
         optimizer.step()
         schedule.step()
     assert not torch.cat([bias, target_bias]).any()
-    values = loss.q_values("cost_qvalue_network", steps, steps["action"])
-    mean, variance = (part[0, :, 0].detach() for part in loss.moments(values))
+    values = loss.values_of_costs(steps, steps["action"])
+    mean, variance = (part[0, :, 0].detach() for part in loss.cost_values.moments(values))
     left = np.arange(4, 0, -1)
     goes_on = end == "gaussian"
     expected = [
@@ -95,9 +96,8 @@ def test_targets_of_the_variance_are_right_on_average_over_costs_and_successors(
     cost, which = rng.integers(0, 2, (2, 1_000_000))
     means, deviations, discount = np.array([2.0, 5.0]), np.array([0.5, 1.5]), 0.81
     returns = cost + discount * rng.normal(means[which], deviations[which])
-    loss = make_loss()
     following = [torch.tensor(value[which]).reshape(1, -1, 1) for value in (means, deviations**2)]
-    target, variance = loss.moment_targets(
+    target, variance = GaussianCosts(tail=0.3).moment_targets(
         torch.tensor(returns.mean()).expand(1, len(which), 1),
         torch.tensor(cost).reshape(-1, 1).double(),
         torch.tensor([discount]).double(),
@@ -147,7 +147,8 @@ def test_the_actor_pays_the_tail_and_its_gradient_is_that_of_finite_differences(
 @pytest.mark.parametrize(("lowest", "later"), [(None, 3.0), (4.0, 4.0)])
 def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowest, later):
     loss = make_loss(networks=4, target_pessimism=1.0, lowest_cost_value=lowest)
-    found, following = torch.tensor([[5.0, 6.0, 1.0, 1.0], [1.0, 3.0, 1.0, 1.0]]).view(2, 4, 1, 1)
+    numbers = torch.tensor([[5.0, 6.0, 1.0, 1.0], [1.0, 3.0, 1.0, 1.0]]).view(2, 4, 1, 1)
+    found, following = (loss.cost_values.arranged(each, 1) for each in numbers)
     errors = loss.cost_errors(found, torch.tensor([[6.0]]), torch.tensor([[0.5]]), following)
     variance, target = np.log1p(np.e), 6.0 + 0.5 * later
     for mean, error in zip((5.0, 6.0), errors.flatten().tolist(), strict=True):
@@ -157,5 +158,75 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
 
 
 def test_a_mean_without_a_variance_is_refused():
-    with pytest.raises(ValueError, match=r"3 cost critics .* has to be even"):
+    with pytest.raises(ValueError, match=r"3 networks of cost critics, and GaussianCosts takes 2"):
         make_loss(networks=3)
+
+
+def quantiles(number=10, tail=1.0, huber=1e-3):
+    return QuantileCosts(number=number, tail=tail, huber=huber)
+
+
+def test_quantiles_of_every_cost_and_critic_come_from_one_network():
+    values = quantiles(number=4)
+    outputs = torch.arange(2 * 3 * 8).reshape(2, 3, 8)  # 2 critics, 3 steps, 2 costs of 4 quantiles
+    arranged = values.arranged(outputs, 2)
+    assert torch.equal(arranged, outputs.reshape(2, 3, 2, 4).movedim(-1, 0))
+
+
+@pytest.mark.parametrize(
+    ("tail", "expected"), [(1.0, 2.5), (0.5, 3.5), (0.25, 4.0), (0.375, 11 / 3)]
+)
+def test_the_tail_is_the_mean_of_the_highest_quantiles(tail, expected):
+    found = quantiles(4, tail).cost(torch.tensor([3.0, 1.0, 4.0, 2.0]).unsqueeze(-1))
+    torch.testing.assert_close(found, torch.tensor([expected]))
+
+
+def test_quantiles_of_a_known_return_are_learned():
+    """A cost of 10 with probability 0.3 and then nothing, or none and then 2 at a discount of ½."""
+    values = quantiles()
+    costs = torch.tensor([10.0] * 30 + [0.0] * 70)[:, None]
+    goes_on = (costs == 0).float() * 0.5
+    following = torch.full((10, 1, 100, 1), 2.0)
+    learned = torch.randn(10, 1, 1, 1, requires_grad=True)
+    optimizer = torch.optim.Adam([learned], lr=0.1)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.995)
+    for _ in range(1500):
+        optimizer.zero_grad()
+        found = learned.expand(10, 1, 100, 1)
+        values.errors(found, costs, goes_on, following, lambda x: x, "l2").mean().backward()
+        optimizer.step()
+        schedule.step()
+    learned = learned.detach().flatten()
+    expected = torch.tensor([1.0] * 7 + [10.0] * 3)  # levels 0.05, 0.15, …
+    torch.testing.assert_close(learned, expected, atol=0.02, rtol=0)
+    assert values.cost(learned[:, None]).item() == pytest.approx(3.7, abs=0.02)
+    assert quantiles(tail=0.3).cost(learned[:, None]).item() == pytest.approx(10.0, abs=0.02)
+
+
+def test_the_quantile_loss_is_the_equation_of_its_article():
+    values = QuantileCosts(number=3, tail=1.0, huber=0.5)
+    found, following = torch.randn(2, 3, 2, 5, 2)
+    costs, discount = torch.rand(5, 2), torch.full((5, 1), 0.9)
+    errors = values.errors(found, costs, discount, following, lambda x: x, "l2")
+    expected = torch.zeros(2, 5, 2)
+    for i, level in enumerate((1 / 6, 1 / 2, 5 / 6)):
+        for j in range(3):
+            change = costs + 0.9 * following[j] - found[i]
+            linear = 0.5 * (change.abs() - 0.25)
+            huber = torch.where(change.abs() <= 0.5, change.square() / 2, linear)
+            expected += (level - (change < 0).float()).abs() * huber / 0.5 / 3
+    torch.testing.assert_close(errors, expected)
+
+
+def test_quantiles_bootstrap_on_the_larger_of_two_and_never_below_the_bound():
+    given = {"target_pessimism": 1.0, "lowest_cost_value": 0.0}
+    loss = make_loss(values=quantiles(2), **given)
+    following = torch.tensor([[-1.0, -2.0], [3.0, 5.0]]).reshape(2, 2, 1, 1)
+    target = torch.tensor([6.0, 8.5]).reshape(2, 1, 1, 1).expand(2, 2, 1, 1)  # 6 + ½ (0, 5)
+    step = torch.tensor([[6.0]]), torch.tensor([[0.5]])
+    found = loss.cost_errors(target, *step, following)
+    expected = loss.cost_errors(
+        target, *step, torch.tensor([0.0, 5.0]).reshape(2, 1, 1, 1).expand(2, 2, 1, 1)
+    )
+    torch.testing.assert_close(found, expected)
+    assert found.max() < loss.cost_errors(target + 1, *step, following).min()
