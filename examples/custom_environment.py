@@ -46,7 +46,7 @@ def danger(robot_xy: torch.Tensor, mines_xy: torch.Tensor, size: float) -> torch
 
 COST = Cost(
     key="cost_mines",
-    active=lambda c: c.constrain_mines and c.mines_num > 0,
+    flags=("constrain_mines", "mines_num"),
     magnitude=lambda c, w: (
         c.mines_cost * danger(w.robot_pos[:, :2], w.at("mines")[..., :2], c.mines_size)
     ),
@@ -54,7 +54,7 @@ COST = Cost(
 
 SPEED = Reading(
     name="speed",
-    present=lambda c: c.observe_speed,
+    flags=("observe_speed",),
     size=lambda c, scene: 1,
     read=lambda w: torch.linalg.vector_norm(w.robot_vel, dim=-1, keepdim=True),
 )

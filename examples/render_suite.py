@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from PIL import Image
 
-from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, make_env
+from safe_rl.envs import SafetyGymEnv, make_env, resolve
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
 ROBOTS, TASKS, LEVELS = ("Point", "Car", "Doggo"), ("Goal", "Button", "Push"), (0, 1, 2)
@@ -35,7 +35,7 @@ def starts(
     name: str, num_rows: int, seed: int, width: int, height: int, nearness: float = 1.0
 ) -> np.ndarray:
     """Frames of starting states, uint8 [num_rows, height, width, 3]."""
-    config = (SUITE | EXTRAS)[name].replace(floor_display_mode=True)
+    config = resolve(name).replace(floor_display_mode=True)
     env = SafetyGymEnv(config, num_envs=num_rows, seed=seed)
     env.reset()
     camera = camera_for(config.placements_extents[2])
@@ -89,7 +89,7 @@ def draw_circle(seed: int) -> Image.Image:
 
 def draw_vision(seed: int) -> Image.Image:
     """The image of the robot's camera with the most detail, out of twelve starts."""
-    config = EXTRAS["PointGoal1Vision"].replace(vision_size=SIZE)
+    config = resolve("PointGoal1Vision").replace(vision_size=SIZE)
     seen = SafetyGymEnv(config, num_envs=12, seed=seed).reset()["observation", "vision"]
     pictures = [Image.fromarray(picture) for picture in (seen * 255).byte().numpy()]
     return max(pictures, key=lambda picture: picture.entropy())

@@ -16,11 +16,10 @@ from safe_rl.envs.extending import (
     register_element,
 )
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config import ROBOTS, registered_keys, set_registered_keys
 from safe_rl.envs.safety_gym.costs import COSTS
 from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.readings import READINGS
-from safe_rl.envs.safety_gym.robots import ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)
@@ -77,7 +76,7 @@ def inside(config, world) -> torch.Tensor:
 
 def register_mines() -> None:
     register_element(disc("mines", "mine"), keys={"mines_size": 0.2, "mines_keepout": 0.3})
-    cost = Cost("cost_mines", lambda c: c.constrain_mines, inside)
+    cost = Cost("cost_mines", ("constrain_mines",), inside)
     register_cost(cost, keys={"constrain_mines": False, "mines_cost": 2.5})
 
 

@@ -12,7 +12,7 @@ import mujoco
 from result_tables import table
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
-from safe_rl.envs.safety_gym.config_keys import Vocabulary
+from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
 from safe_rl.envs.safety_gym.elements import ELEMENTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
@@ -79,7 +79,7 @@ def _suite_table(names: Iterable[str]) -> str:
     for name in names:
         env = SafetyGymEnv(name, num_envs=1)
         kinds = [f"`{key}`" for key in env.cost_keys if key not in ("cost", EXCEPTION_KEY)]
-        objects = {e.kind: e.count((SUITE | EXTRAS)[name]) for e in ELEMENTS}
+        objects = {e.kind: e.count(env.config) for e in ELEMENTS}
         there = [f"{n} {kind if n > 1 else kind[:-1]}" for kind, n in objects.items() if n]
         rows.append([f"`{name}`", *_sizes(env), ", ".join(kinds) or "none", ", ".join(there)])
     return table(["`env=`", "size of observation", "size of action", "costs", "objects"], rows)
@@ -96,18 +96,18 @@ def velocity() -> str:
         [
             f"`{name}`",
             f"{name.removeprefix('Safe').removesuffix('Velocity')}-v5",
-            f"{config.velocity_threshold:g}",
-            *_sizes(VelocityEnv(config, num_envs=1)),
+            f"{keys['velocity_threshold']:g}",
+            *_sizes(VelocityEnv(keys, num_envs=1)),
         ]
-        for name, config in VELOCITY_SUITE.items()
+        for name, keys in VELOCITY_SUITE.items()
     ]
     sizes = ["size of observation", "size of action"]
     return table(["`env=`", "Gymnasium's id", "threshold [m/s]", *sizes], rows)
 
 
 def keys() -> str:
-    """Every key of an environment, by what it is about: the comments of the vocabulary."""
-    source = inspect.getsource(Vocabulary)
+    """Every key of an environment, by what it is about: the comments of the dataclass."""
+    source = inspect.getsource(Keys)
     heading = {key: name for name, key in re.findall(r"\n    # ([^\n]+)\n    (\w+):", source)}
     groups: dict[str, list[Sequence[str]]] = {}
     for row in key_table():

@@ -3,15 +3,17 @@
 Names and keys are imported at once. Modules that build environments are imported at first use.
 """
 
+import os
 from typing import TYPE_CHECKING
 
-# First, because it imports MuJoCo where OpenGL is missing.
-from safe_rl.envs.pictures import OpenGLError
-
-# isort: split
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import complete_env, env_names, env_node
-from safe_rl.envs.registration import register_gymnasium, store_config, store_configs
+from safe_rl.envs.families import (
+    complete_env,
+    env_names,
+    env_node,
+    store_config,
+    store_configs,
+)
 from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.lazy import import_later
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
     from safe_rl.envs.gymnasium.conversion import from_gymnasium, from_six_values
     from safe_rl.envs.making import make_env
+    from safe_rl.envs.pictures import OpenGLError
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
 
@@ -52,9 +55,11 @@ __getattr__, __dir__ = import_later(
         "contract": ["ConstrainedEnv", "ContractError", "check_constrained_env"],
         "gymnasium.conversion": ["from_gymnasium", "from_six_values"],
         "making": ["make_env"],
+        "pictures": ["OpenGLError"],
         "safety_gym.env": ["SafetyGymEnv"],
         "safety_gym.layouts": ["LayoutError"],
     },
 )
 
-register_gymnasium()
+if os.environ.get("MUJOCO_GL"):  # MuJoCo then loads OpenGL; this module can do without
+    import safe_rl.envs.pictures  # noqa: F401

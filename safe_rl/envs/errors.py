@@ -24,13 +24,3 @@ def require_integer(name: str, value: Any, lowest: int) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value < 2**63:
         words = f"an integer of at least {lowest} and below 2**63"
         raise ConfigError(f"'{name}' must be {words}, got {value!r}.")
-
-
-def require_all_rows(stepped: Any) -> None:
-    """Raise NotImplementedError if only some rows are to step: bool [N], or None for all rows."""
-    if stepped is not None and not stepped.all():
-        raise NotImplementedError(
-            "A transform of TorchRL, such as ConditionalSkip or MultiAction, asks for a step of "
-            "some worlds only ('_step'), but all worlds are stepped together. Use num_envs=1; to "
-            "hold actions, use ActionRepeat of safe_rl.envs.transforms."
-        )

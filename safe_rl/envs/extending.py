@@ -15,9 +15,10 @@ from typing import Any
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import Key
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import infer_key, registered_keys, set_registered_keys
-from safe_rl.envs.safety_gym.config_keys import Key, Locations, Objects, Placements
+from safe_rl.envs.safety_gym.config import ROBOTS, infer_key, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config_keys import Locations, Objects, Placements
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY, Cost, contact_cost, hazard_cost
 from safe_rl.envs.safety_gym.elements import (
     BOX,
@@ -31,7 +32,7 @@ from safe_rl.envs.safety_gym.elements import (
     Motion,
 )
 from safe_rl.envs.safety_gym.readings import READINGS, Reading
-from safe_rl.envs.safety_gym.robots import ROBOTS, load_robot
+from safe_rl.envs.safety_gym.robots import load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
 from safe_rl.envs.safety_gym.world import World
 from safe_rl.naming import did_you_mean
@@ -163,13 +164,13 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
     Examples:
         >>> speeding = Cost(
         ...     "cost_speeding",
-        ...     active=lambda c: c.constrain_speed,
+        ...     flags=("constrain_speed",),
         ...     magnitude=lambda c, w: (w.robot_vel.norm(dim=-1) - c.speed_limit).clamp(min=0.0),
         ... )
         >>> register_cost(speeding, keys={"constrain_speed": False, "speed_limit": 1.0})
     """
     _refuse_taken("cost", cost.key)
-    _require_functions(active=cost.active, magnitude=cost.magnitude)
+    _require_functions(magnitude=cost.magnitude)
     if not cost.key.startswith("cost_"):
         raise ConfigError(f"The cost key '{cost.key}' must start with 'cost_'.")
     _refuse_unknown_kinds(cost.touches)
@@ -191,14 +192,14 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
     Examples:
         >>> height = Reading(
         ...     "height",
-        ...     present=lambda c: c.observe_height,
+        ...     flags=("observe_height",),
         ...     size=lambda c, scene: 1,
         ...     read=lambda w: w.robot_pos[:, 2:],
         ... )
         >>> register_observation(height, keys={"observe_height": False})
     """
     _refuse_taken("observation", reading.name)
-    _require_functions(present=reading.present, size=reading.size, read=reading.read)
+    _require_functions(size=reading.size, read=reading.read)
     _refuse_unknown_kinds(reading.touches)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]

@@ -1,4 +1,4 @@
-"""The table of families: names of environments, nodes of the configuration, and their defaults.
+"""Names and keys of all environments, for Hydra, for Gymnasium and for `make_env`.
 
 The key `_target_` of a node names its family: a function or class that is called with a mapping of
 the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without it
@@ -12,20 +12,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from typing import Any
 
 import gymnasium
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
 
 from safe_rl.envs.costs import parse_ranges
 from safe_rl.envs.errors import ConfigError, on_cpu_only
+from safe_rl.envs.keys import Count, Key, Text, checked, structured
+from safe_rl.envs.safety_gym.config import KEYS, SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
-from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, resolve_velocity
+from safe_rl.envs.velocity.velocity_config import (
+    ANNOTATIONS,
+    VELOCITY_SUITE,
+    VelocityConfig,
+    resolve_velocity,
+)
 from safe_rl.naming import did_you_mean
-from safe_rl.ranges import Count, Text, values_of
+from safe_rl.trust import allow
+
+GROUP = "env"
+"""The group of environments in Hydra."""
+VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
+SAFETY_GYM = "safety_gym"
+"""The environment with the default of every key of Safety Gym, from which others inherit."""
 
 # These classes use another package by default; MuJoCo's own library is installed.
 _MUJOCO = {"backend": "mujoco", "parallel": False}
@@ -36,26 +47,70 @@ TORCHRL_CLASSES: dict[str, Mapping[str, Any]] = {
 }
 """Classes of `torchrl.envs` that need no `import=`, and their default arguments."""
 
+_RANGES = (
+    "costs of leaving a range: cost_<kind> -> [column of the observation, lowest, highest], of "
+    "another entry [entry, column, lowest, highest]"
+)
+_COSTS = Key(
+    None, tuple[Text, ...] | None, "names of the costs; null: `cost` and all `cost_<kind>`"
+)
+_STEPS = Key(None, Count | None, "steps after which an episode is truncated; null: its own number")
+_ARGUMENTS = Key(None, dict[str, Any] | None, "arguments of its constructor: {g: 9.81}")
+_MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
+_COMMON = {"cost_keys": _COSTS, "num_steps": _STEPS, "kwargs": _ARGUMENTS}
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True)
 class ForeignFamily:
-    """The environments of one library.
+    """The environments of one library; `env=<name> env.id=…` chooses one.
 
     Attributes:
         target: `_target_` of its nodes.
         title: Name of one of its environments in messages.
-        keys: Key -> its default, and an annotation of its allowed values. `id` and `name`, which
-            all families have, are not listed.
-        check: Checks the whole node before an environment is made.
+        keys: Its keys. `id` and `name`, which all families have, are not listed.
         describe: "module:function" that returns the cost keys and the length of episodes of a node.
             If one of them is None, it makes an environment to find out.
     """
 
     target: str
     title: str
-    keys: Mapping[str, tuple[Any, Any]]
-    check: Callable[[Mapping[str, Any]], None]
+    keys: Mapping[str, Key]
     describe: str
+
+
+FOREIGN = {
+    "gymnasium": ForeignFamily(
+        "safe_rl.envs.gymnasium.make_gymnasium",
+        "A Gymnasium environment",
+        {
+            **_COMMON,
+            "render_mode": _MODE,
+            "outside": Key(None, Any, _RANGES),
+            "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
+        },
+        "safe_rl.envs.gymnasium.conversion:describe_gymnasium",
+    ),
+    "safety_gymnasium": ForeignFamily(
+        "safe_rl.envs.gymnasium.make_safety_gymnasium",
+        "An environment of Safety-Gymnasium",
+        {**_COMMON, "render_mode": _MODE},
+        "safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
+    ),
+    "torchrl": ForeignFamily(
+        "safe_rl.envs.torchrl.make_torchrl",
+        "An environment of TorchRL",
+        {
+            **_COMMON,
+            "observe": Key(None, tuple[Text, ...] | None, "entries; null: `observation` or all"),
+            "flatten": Key(True, bool, "true: several entries become one vector"),
+            "outside": Key(None, Any, _RANGES),
+            "cost": Key(None, Any, "a function from a step to its cost: my_module:function, or "
+                        "{_target_: my_module.function, limit: 4}"),
+        },
+        "safe_rl.envs.torchrl.torchrl_env:describe_node",
+    ),
+}  # fmt: skip
+"""Name in the group `env` -> family of another library."""
 
 
 def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,18 +130,32 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
             )
     if not isinstance(node.get("id"), str):
         raise ConfigError("Which environment? Name it: env.id=…")
-    full = {"name": node["id"], **{key: row[0] for key, row in family.keys.items()}, **node}
-    for key, (_, annotation) in family.keys.items():
-        values = values_of(annotation)
-        if not values.hold(full[key]):
-            raise ConfigError(f"'{key}' must be {values.words}, got {full[key]!r}.")
-    family.check(full)
+    full = {"name": node["id"], **node}
+    for key, row in family.keys.items():
+        checked(key, row.annotation, full.setdefault(key, row.default))
+    _check_id(family, node["id"])
     parse_ranges(full.get("outside"))
     if None in (full["cost_keys"], full["num_steps"]):
         # Imported here, because environments need torch and their names do not.
         module, _, function = family.describe.partition(":")
         full["cost_keys"], full["num_steps"] = getattr(import_module(module), function)(full)
     return full
+
+
+def _check_id(family: ForeignFamily, name: str) -> None:
+    module, _, plain = name.rpartition(":")
+    if family is not FOREIGN["torchrl"] and module:  # Gymnasium would import it
+        raise ConfigError(
+            f"env.id={name}: a configuration cannot import a module. If you trust '{module}', use "
+            f"import={module} env.id={plain}"
+        )
+    if family is FOREIGN["torchrl"] and "." not in name and name not in TORCHRL_CLASSES:
+        raise ConfigError(
+            f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
+            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class of TorchRL use "
+            "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
+            "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
+        )
 
 
 def hint_of_gymnasium(name: str) -> str:
@@ -97,141 +166,119 @@ def hint_of_gymnasium(name: str) -> str:
     return f" It is one of Gymnasium's: env=gymnasium env.id={name}."
 
 
-def _check_gymnasium(node: Mapping[str, Any]) -> None:
-    module, _, plain = node["id"].rpartition(":")
-    if module:  # Gymnasium would import it
-        raise ConfigError(
-            f"env.id={node['id']}: a configuration cannot import a module. If you trust "
-            f"'{module}', use import={module} env.id={plain}"
-        )
-
-
-def _check_torchrl(node: Mapping[str, Any]) -> None:
-    name = node["id"]
-    if "." not in name and name not in TORCHRL_CLASSES:
-        raise ConfigError(
-            f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
-            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class of TorchRL use "
-            "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
-            "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
-        )
-
-
-_Names, _Arguments = list[Text] | None, Mapping[str, Any] | None
-_COMMON: dict[str, tuple[Any, Any]] = {
-    "cost_keys": (None, _Names),
-    "num_steps": (None, Count | None),
-    "kwargs": (None, _Arguments),
-}
-_GYMNASIUM_KEYS = {**_COMMON, "render_mode": (None, Text | None)}
-
-GYMNASIUM = ForeignFamily(
-    target="safe_rl.envs.gymnasium.make_gymnasium",
-    title="A Gymnasium environment",
-    keys={**_GYMNASIUM_KEYS, "outside": (None, Any), "flatten": (False, bool)},
-    check=_check_gymnasium,
-    describe="safe_rl.envs.gymnasium.conversion:describe_gymnasium",
-)
-SAFETY_GYMNASIUM = ForeignFamily(
-    target="safe_rl.envs.gymnasium.make_safety_gymnasium",
-    title="An environment of Safety-Gymnasium",
-    keys=_GYMNASIUM_KEYS,
-    check=_check_gymnasium,
-    describe="safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
-)
-TORCHRL = ForeignFamily(
-    target="safe_rl.envs.torchrl.make_torchrl",
-    title="An environment of TorchRL",
-    keys={**_COMMON, "observe": (None, _Names), "flatten": (True, bool)}
-    | dict.fromkeys(("outside", "cost"), (None, Any)),
-    check=_check_torchrl,
-    describe="safe_rl.envs.torchrl.torchrl_env:describe_node",
-)
-
-FOREIGN = {
-    "gymnasium": GYMNASIUM, "torchrl": TORCHRL, "safety_gymnasium": SAFETY_GYMNASIUM
-}  # fmt: skip
-"""Name in the group `env` -> family of another library; its environment is named by `id`."""
-GROUP = "env"
-"""The group of environments in Hydra."""
-VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
-
-
-def config_node(name: str, config: Any, target: str | None = None) -> dict[str, Any]:
-    """Return a configuration as a node of the group `env`: `name`, family, and every key.
-
-    Args:
-        name: Name of the environment.
-        config: A `SafetyGymConfig` or a `VelocityConfig`.
-        target: `_target_` of the family; None is Safety Gym's.
-    """
-    family = {} if target is None else {"_target_": target}
-    return {"name": name, **family, **{k: _plain(v) for k, v in config.to_dict().items()}}
-
-
-def _plain(value: Any) -> Any:
-    """Turn tuples into lists, because Hydra has no tuples."""
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
-
-
-def _complete(
-    resolve: Callable[[Mapping[str, Any]], Any], target: str | None, node: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Add the defaults of missing keys to a node; its own keys keep their values."""
-    config = resolve({key: value for key, value in node.items() if key not in ("name", "_target_")})
-    return {**config_node(node.get("name", "custom"), config, target), **node}
-
-
-_SUITES: dict[str | None, Mapping[str, Any]] = {
-    None: SUITE | EXTRAS,
-    VELOCITY_TARGET: VELOCITY_SUITE,
-}
-FAMILIES: dict[str | None, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
-    None: partial(_complete, resolve, None),
-    VELOCITY_TARGET: partial(_complete, resolve_velocity, VELOCITY_TARGET),
-    **{family.target: partial(complete_foreign, family) for family in FOREIGN.values()},
-}
-"""`_target_` -> function that completes a node. A node with another target is used as it is."""
-
-_TARGETS = {name: target for target, suite in _SUITES.items() for name in suite}
+_STORED: dict[str, dict[str, Any]] = {}
+"""The nodes of `store_config` by name."""
 
 
 def env_names() -> list[str]:
-    """Return the names of the environments of all families, without stored ones."""
-    return list(_TARGETS)
+    """Return the names of the environments of the package."""
+    return [*SUITE, *EXTRAS, *VELOCITY_SUITE]
 
 
-def env_node(name: str) -> dict[str, Any]:
-    """Return the node of the group `env` for a name; KeyError if there is none."""
-    target = _TARGETS[name]
-    return config_node(name, _SUITES[target][name], target)
+def env_node(env: str | SafetyGymConfig | VelocityConfig, name: str = "") -> dict[str, Any]:
+    """Return the node of the group `env` for a name or a configuration, with every key.
+
+    Raises:
+        ConfigError: For an unknown name.
+    """
+    if isinstance(env, str):
+        if env in _STORED:
+            return dict(_STORED[env])
+        if env in FOREIGN:
+            return {"_target_": FOREIGN[env].target}
+        if env in VELOCITY_SUITE:
+            return env_node(resolve_velocity(env), env)
+        if env.removeprefix("Safexp-").removesuffix("-v0") not in SUITE | EXTRAS:
+            hint = did_you_mean(env, [*env_names(), *FOREIGN, *_STORED])
+            raise ConfigError(
+                f"Unknown environment '{env}'.{hint} If a module of yours stores it by that name "
+                "(store_config), import the module first."
+            )
+        return env_node(resolve(env), env)
+    name = name or "custom"
+    if isinstance(env, VelocityConfig):
+        return {"name": name, "_target_": VELOCITY_TARGET, **_lists(env.to_dict())}
+    return {"name": name, **_lists(resolve(env).to_dict())}
+
+
+def _lists(value: Any) -> Any:
+    """Turn tuples into lists, because Hydra has no tuples."""
+    if isinstance(value, Mapping):
+        return {key: _lists(item) for key, item in value.items()}
+    return [_lists(item) for item in value] if isinstance(value, tuple) else value
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
-    """Complete a node that has only the keys that differ from the defaults of its family.
+    """Check a node, and add the keys that it does not have.
 
     Raises:
         ConfigError: For an unknown key or a value that cannot be used.
     """
-    complete = FAMILIES.get(node.get("_target_"))
-    return dict(node) if complete is None else complete(node)
+    target = node.get("_target_")
+    for family in FOREIGN.values():
+        if target == family.target:
+            return complete_foreign(family, node)
+    keys = {key: value for key, value in node.items() if key not in ("name", "_target_")}
+    resolvers: dict[Any, Callable[..., Any]] = {None: resolve, VELOCITY_TARGET: resolve_velocity}
+    return {**env_node(resolvers[target](keys)), **node} if target in resolvers else dict(node)
 
 
-def stored_node(name: str) -> dict[str, Any] | None:
-    """Return the node that `safe_rl.envs.store_config` stored by a name, or None."""
-    held = _stored().get(f"{name}.yaml")
-    if held is None:
-        return None
-    node = OmegaConf.to_container(OmegaConf.create(held.node), resolve=False)
-    return {str(key): value for key, value in node.items()} if isinstance(node, dict) else None
+def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig | VelocityConfig) -> None:
+    """Give a configuration a name, with which `env=<name>` and `make_env(name)` find it.
+
+    Args:
+        name: Name of the environment.
+        config: A configuration (a mapping of Safety Gym's keys may have only those that differ from
+            the defaults), or a node with the `_target_` of another family. The module of that
+            target may then be imported, as with `import=`.
+
+    Raises:
+        ConfigError: For the name of a built-in environment, an unknown key, or a value that cannot
+            be used.
+
+    Examples:
+        >>> from safe_rl.envs import make_env
+        >>> store_config("CrowdedPoint", {"robot_base": "point", "hazards_num": 9})
+        >>> make_env("CrowdedPoint").config.hazards_num
+        9
+    """
+    if name in (*env_names(), *FOREIGN, SAFETY_GYM):
+        raise ConfigError(f"'{name}' is a built-in environment: choose another name.")
+    if isinstance(config, Mapping) and config.get("_target_") is not None:
+        _STORED[name] = {"name": name, **config}
+        module = str(config["_target_"]).rpartition(".")[0]
+        if module.partition(".")[0] not in ("safe_rl", "torch"):
+            allow(module)
+    else:
+        _STORED[name] = env_node(resolve(config) if isinstance(config, Mapping) else config, name)
+    store_configs()
 
 
-def known_names() -> list[str]:
-    """Return the names that `make_env` takes: those of all families, and the stored ones."""
-    return [*env_names(), *FOREIGN, *(key.removesuffix(".yaml") for key in _stored())]
+def store_configs() -> None:
+    """Put all environments into Hydra's ConfigStore, as in `env=PointGoal1 env.hazards_num=3`."""
+    text = {"name": Key(SAFETY_GYM, Text)}
+    ConfigStore.instance().store(SAFETY_GYM, structured("SafetyGym", text | KEYS), GROUP)
+    for name, keys in (SUITE | EXTRAS | _STORED).items():
+        head = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
+        ConfigStore.instance().store(name, {**head, "name": name, **_lists(keys)}, GROUP)
+    for name, row in VELOCITY_SUITE.items():
+        values = {"_target_": VELOCITY_TARGET, "name": name, **row}
+        keys = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
+        ConfigStore.instance().store(name, structured(name, keys), GROUP)
+    for name, family in FOREIGN.items():
+        head = {"_target_": family.target, "name": "${.id}", "id": "???"}
+        keys = {key: Key(value, str) for key, value in head.items()} | family.keys
+        ConfigStore.instance().store(name, structured(name, keys), GROUP)
 
 
-def _stored() -> Mapping[str, Any]:
-    """Return the nodes in Hydra's group of environments, by file name."""
-    group = ConfigStore.instance().repo.get(GROUP, {})
-    return {key: held for key, held in group.items() if key.endswith(".yaml")}
+# `Safexp-{name}-v0`, and `Safexp-Custom-v0` with the default of every key. They take a `config`
+# with keys to change. Ids of the velocity family are `SafeHopperVelocity-v0` and so on.
+_IDS = {f"Safexp-{name}-v0": name for name in (*SUITE, *EXTRAS)} | {"Safexp-Custom-v0": None}
+for _id, _name in (_IDS | {f"{name}-v0": name for name in VELOCITY_SUITE}).items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            _id,
+            entry_point="safe_rl.envs.gymnasium.gymnasium_interfaces:WorldEnv",
+            vector_entry_point="safe_rl.envs.gymnasium.gymnasium_interfaces:WorldVectorEnv",
+            kwargs={"name": _name},
+        )

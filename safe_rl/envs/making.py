@@ -10,18 +10,9 @@ import torch
 
 from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import (
-    FOREIGN,
-    VELOCITY_TARGET,
-    config_node,
-    env_names,
-    env_node,
-    known_names,
-    stored_node,
-)
+from safe_rl.envs.families import env_node
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
-from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.transforms.environment import transform_env
 from safe_rl.envs.velocity.velocity_config import VelocityConfig
 from safe_rl.naming import did_you_mean
@@ -66,7 +57,7 @@ def make_env(
     given: dict[str, Any] = {
         "num_envs": num_envs, "device": device, "seed": seed, "num_threads": num_threads
     }  # fmt: skip
-    node = dict(_node(env))
+    node = dict(env if isinstance(env, Mapping) else env_node(env))
     for key in keys.keys() - node.keys():
         if meant := did_you_mean(key, [*given, "transforms"], 0.85):
             raise ConfigError(f"There is no argument '{key}'.{meant}")
@@ -99,27 +90,4 @@ def _check_arguments(
         raise ContractError(
             f"{target}: {error}. It is called with the keys of env as the first argument, and with "
             f"{', '.join(given)} by name."
-        ) from None
-
-
-def _node(env: Any) -> Mapping[str, Any]:
-    """Return the node of a name (also as in the 2019 engine), a mapping or a configuration."""
-    if isinstance(env, Mapping):
-        return env
-    if isinstance(env, VelocityConfig):
-        return config_node("custom", env, VELOCITY_TARGET)
-    if not isinstance(env, str):
-        return config_node("custom", resolve(env))
-    if env in env_names():
-        return env_node(env)
-    if env in FOREIGN:
-        return {"_target_": FOREIGN[env].target}
-    if (stored := stored_node(env)) is not None:
-        return stored
-    try:
-        return config_node("custom", resolve(env))
-    except ConfigError:
-        raise ConfigError(
-            f"Unknown environment '{env}'.{did_you_mean(env, known_names())} If a module of "
-            "yours stores it by that name (store_config), import the module first."
         ) from None

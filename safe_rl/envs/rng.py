@@ -25,13 +25,6 @@ def _shift_right(x: Tensor, bits: int) -> Tensor:
     return (x >> bits).bitwise_and_((1 << (64 - bits)) - 1)
 
 
-def _spread(counter: Tensor | int) -> Tensor | int:
-    """Multiply by an odd constant, so that neighbours differ in many bits; an int stays an int."""
-    if isinstance(counter, Tensor):
-        return counter * _MIX_2
-    return (counter * _MIX_2 + (1 << 63)) % (1 << 64) - (1 << 63)
-
-
 def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
     """Hash int64 keys with counters, one after the other, into int64 keys of the broadcast shape.
 
@@ -42,7 +35,11 @@ def fold(key: Tensor, *counters: Tensor | int) -> Tensor:
         1
     """
     for counter in counters:
-        key = (key ^ _spread(counter)).add_(_GAMMA)
+        # multiplied by an odd constant, so that neighbours differ in many bits
+        spread = counter * _MIX_2
+        if isinstance(spread, int):  # as int64
+            spread = (spread + (1 << 63)) % (1 << 64) - (1 << 63)
+        key = (key ^ spread).add_(_GAMMA)
         key.bitwise_xor_(_shift_right(key, 30)).mul_(_MIX_1)
         key.bitwise_xor_(_shift_right(key, 27)).mul_(_MIX_2)
         key.bitwise_xor_(_shift_right(key, 31))

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.errors import require_all_rows, require_integer
+from safe_rl.envs.errors import require_integer
 from safe_rl.envs.physics import Physics
 
 
@@ -45,10 +45,11 @@ class SimulatedEnv(ConstrainedEnv):
     _all_begun = False
 
     config: Any
+    #: Draws the worlds, with `frames` as in `WorldRenderer`; a cached property.
+    _renderer: Any
     cost_keys: list[str]
     _physics: Physics
     _observer: Any
-    _renderer: Any
 
     def __init__(self, num_envs: int, device: torch.device | str, num_threads: int) -> None:
         require_integer("num_envs", num_envs, lowest=1)
@@ -69,6 +70,8 @@ class SimulatedEnv(ConstrainedEnv):
         self._begun = self._has_cost.clone()
         low, high = torch.from_numpy(model.actuator_ctrlrange.T.copy())
         self._control_range = (low.to(physics.ctrl), high.to(physics.ctrl))
+        self.max_episode_steps = self.config.num_steps
+        self.observation_layout = dict(self._observer.columns)
         batch, scalar = self.batch_size, (*self.batch_size, 1)
         kind: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
         flag = Binary(1, shape=scalar, dtype=torch.bool, device=self.device)
@@ -81,16 +84,6 @@ class SimulatedEnv(ConstrainedEnv):
         self.reward_spec = Composite(reward=Unbounded(shape=scalar, **kind), **costs, shape=batch)
         self.done_spec = Composite(**ends, shape=batch)
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
-
-    @property
-    def max_episode_steps(self) -> int:
-        """Steps after which an episode is truncated."""
-        return self.config.num_steps
-
-    @property
-    def observation_layout(self) -> dict[str, slice]:
-        """Columns of every named component in `observation`."""
-        return dict(self._observer.columns)
 
     @property
     def observation_bounds(self) -> dict[str, tuple[float, float]]:
@@ -133,21 +126,14 @@ class SimulatedEnv(ConstrainedEnv):
         self._has_cost &= ~mask
         self._begun |= mask
         self._all_begun = self._all_begun or bool(self._begun.all())
-        return self._reset_output()
+        return self._output(self._begun.new_zeros(len(self.flags), len(self._begun)))
 
-    def _reset_output(self) -> TensorDict:
-        """Return the output of a reset for the present state of the worlds."""
-        none = torch.zeros_like(self._begun).expand(len(self.flags), -1).unsqueeze(-1).clone()
-        return self._pack(dict(zip(self.flags, none, strict=True)))
-
-    def _step_output(self, numbers: Tensor, flags: Tensor) -> TensorDict:
-        """Return the output of a step: reward and costs [1 + K, N], and `flags`, bool [F, N]."""
-        names = ("reward", *self.cost_keys, *self.flags)
-        values = (*numbers.to(torch.float32).unsqueeze(-1), *flags.unsqueeze(-1))
-        return self._pack(dict(zip(names, values, strict=True)))
-
-    def _pack(self, outputs: dict[str, Any]) -> TensorDict:
-        """Move outputs to the device, and add the observation."""
+    def _output(self, flags: Tensor, numbers: Tensor | None = None) -> TensorDict:
+        """Return the output of a reset or step: flags [F, N], and reward and costs [1 + K, N]."""
+        outputs: dict[str, Any] = dict(zip(self.flags, flags.unsqueeze(-1), strict=True))
+        if numbers is not None:
+            names = ("reward", *self.cost_keys)
+            outputs |= zip(names, numbers.to(torch.float32).unsqueeze(-1), strict=True)
         if self.device != self._physics.device:
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
         outputs["observation"] = self._observe()
@@ -159,7 +145,13 @@ class SimulatedEnv(ConstrainedEnv):
         return next_tensordict_out
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
-        require_all_rows(tensordict.get("_step", None))
+        stepped = tensordict.get("_step", None)
+        if stepped is not None and not stepped.all():
+            raise NotImplementedError(
+                "A transform of TorchRL, such as ConditionalSkip or MultiAction, asks for a step "
+                "of some worlds only ('_step'), but all worlds are stepped together. Use "
+                "num_envs=1; to hold actions, use ActionRepeat of safe_rl.envs.transforms."
+            )
         action, needed = tensordict["action"], self._physics.ctrl.shape
         if action.shape != needed or not action.dtype.is_floating_point:
             raise ValueError(
@@ -207,7 +199,7 @@ class SimulatedEnv(ConstrainedEnv):
         self._has_cost.zero_()
         self._begun.fill_(True)
         self._all_begun = True
-        return self._reset_output()
+        return self._output(self._begun.new_zeros(len(self.flags), len(self._begun)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let `copy` and `pickle` build a new environment and set its state by `set_state`."""
@@ -257,7 +249,8 @@ class SimulatedEnv(ConstrainedEnv):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the resources of OpenGL."""
-        self._renderer.close()
+        if "_renderer" in vars(self):  # it is made for the first picture
+            self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
 
 

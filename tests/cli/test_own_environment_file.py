@@ -5,7 +5,7 @@ import yaml
 from commands import SMALL
 
 from safe_rl.cli import evaluate, train
-from safe_rl.envs import SUITE, SafetyGymConfig
+from safe_rl.envs import SafetyGymConfig, resolve
 
 FILES = {
     "mine": {"name": "mine", "robot_base": "point", "num_steps": 20, "hazards_num": 2},
@@ -46,6 +46,6 @@ def test_it_trains_resumes_and_is_evaluated(run_with, capsys):
 
 def test_it_can_start_from_one_of_the_suite_and_takes_every_key(run_with):
     _, env = run_with("like", "frames=40", "env.vases_num=3")
-    goal = SUITE["PointGoal1"]
+    goal = resolve("PointGoal1")
     assert (env["hazards_num"], env["lidar_num_bins"]) == (goal.hazards_num, 16)
     assert (env["name"], env["num_steps"], env["vases_num"]) == ("like", 20, 3)

@@ -73,7 +73,7 @@ def test_errors_are_one_line(folder, module, message):
     (folder / "users_needy.py").write_text("import users_nowhere\n")
     (folder / "users_refused.py").write_text(
         "from safe_rl.envs.extending import Cost, register_cost\n"
-        "register_cost(Cost(key='speed', active=bool, magnitude=max))\n"
+        "register_cost(Cost(key='speed', flags=(), magnitude=max))\n"
     )
     (folder / "users_unread.py").write_text("x = (\n")
     (folder / "json.py").write_text("")

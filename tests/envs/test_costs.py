@@ -6,7 +6,7 @@ import pytest
 import torch
 from crafting import arrange, make, position_columns, step_from
 
-from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs import SafetyGymEnv, resolve
 
 pytestmark = pytest.mark.filterwarnings("ignore:'constrain_")  # of kinds without objects
 ALL_KINDS = ("hazards", "vases", "pillars", "buttons", "gremlins")
@@ -138,7 +138,7 @@ def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
 
 @pytest.mark.parametrize("name", ["CarGoal2", "DoggoButton2", "PointPush2"])
 def test_costs_and_rewards_follow_from_them(name):
-    env = SafetyGymEnv(SUITE[name].replace(hazards_size=0.9, goal_size=0.01), num_envs=8, seed=0)
+    env = SafetyGymEnv(resolve(name).replace(hazards_size=0.9, goal_size=0.01), num_envs=8, seed=0)
     tensordict, seen = env.reset(), 0
     for _ in range(30):
         before = env.get_positions()

@@ -11,25 +11,25 @@ import pytest
 import torch
 from playing import assert_same, play
 
-from safe_rl.envs import SUITE, SafetyGymEnv
-from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
+from safe_rl.envs import SafetyGymEnv, resolve
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv, resolve_velocity
 
 # Short episodes and large goals, so that the compared steps include resets and new goals. Where a
 # goal ends the episode, single rows are reset.
 BUSY = {"num_steps": 20}
 CONFIGS = {
-    "goal": SUITE["PointGoal2"].replace(
+    "goal": resolve("PointGoal2").replace(
         **BUSY, goal_size=1.8, continue_goal=False, gremlins_num=2, observe_gremlins=True
     ),
-    "button": SUITE["CarButton2"].replace(**BUSY, buttons_size=0.2),
-    "push": SUITE["DoggoPush2"].replace(**BUSY, goal_size=1.0),
-    "noise": SUITE["PointPush1"].replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),
+    "button": resolve("CarButton2").replace(**BUSY, buttons_size=0.2),
+    "push": resolve("DoggoPush2").replace(**BUSY, goal_size=1.0),
+    "noise": resolve("PointPush1").replace(**BUSY, action_noise=0.3, frameskip_binom_p=0.7),
 }
 # With random actions, goals are often met only in these.
 MEETS_GOALS = ("goal", "push")
 NAMES = [*CONFIGS, *VELOCITY_SUITE]
-CONFIGS["nested"] = SUITE["CarGoal1"].replace(**BUSY, observation_flatten=False, layout_seeds=3)
-CONFIGS["one layout"] = SUITE["PointPush1"].replace(**BUSY, randomize_layout=False)
+CONFIGS["nested"] = resolve("CarGoal1").replace(**BUSY, observation_flatten=False, layout_seeds=3)
+CONFIGS["one layout"] = resolve("PointPush1").replace(**BUSY, randomize_layout=False)
 COPY = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
@@ -37,7 +37,7 @@ def make(name: str, num_envs: int, seed: int | None = 0, num_threads: int = 1, *
     """Of either family; robots of the velocity family do not sleep."""
     settings = {"num_envs": num_envs, "seed": seed, "num_threads": num_threads}
     if name in VELOCITY_SUITE:
-        return VelocityEnv(VELOCITY_SUITE[name].replace(num_steps=12), **settings)
+        return VelocityEnv(resolve_velocity(name).replace(num_steps=12), **settings)
     return SafetyGymEnv(CONFIGS[name], **settings, **sleep)
 
 

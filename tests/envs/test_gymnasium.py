@@ -20,7 +20,7 @@ from safe_rl.envs import (
     env_node,
     make_env,
 )
-from safe_rl.envs.velocity import VELOCITY_SUITE
+from safe_rl.envs.velocity import VELOCITY_SUITE, resolve_velocity
 
 IDS = [f"Safexp-{name}-v0" for name in (*SUITE, *EXTRAS)]
 SHORT = {"num_steps": 3}
@@ -88,7 +88,7 @@ def test_any_configuration_can_be_made():
     assert "cost_hazards" in env.step(env.action_space.sample())[-1]
     changed = gymnasium.make("Safexp-PointGoal1-v0", config={"lidar_num_bins": 8})
     assert changed.observation_space.shape == (12 + 3 * 8,)
-    hopper = VELOCITY_SUITE["SafeHopperVelocity"].replace(num_steps=7)
+    hopper = resolve_velocity("SafeHopperVelocity").replace(num_steps=7)
     assert gymnasium.make("SafeHopperVelocity-v0", config=hopper).spec.max_episode_steps == 7
     for told, name, given in (
         ("Did you mean 'hazards_num'", "Safexp-Custom", {"config": {"hazard_num": 2}}),

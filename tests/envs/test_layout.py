@@ -11,7 +11,7 @@ from crafting import kind_of, make, places
 from scipy import stats
 from tensordict import TensorDict
 
-from safe_rl.envs import SUITE, LayoutError, SafetyGymEnv
+from safe_rl.envs import SUITE, LayoutError, SafetyGymEnv, resolve
 
 NUM_LAYOUTS = 800
 # Without substeps, a step computes the costs and rewards of the state that it starts from.
@@ -23,7 +23,7 @@ UNLIKELY = 1e-3  # p values below this one would be a finding
 @pytest.fixture(params=SUITE, scope="module")
 def start(request):
     """Name, environment and first TensorDict of many fresh layouts, none of which has moved."""
-    config = SUITE[request.param].replace(**FROZEN)
+    config = resolve(request.param).replace(**FROZEN)
     env = make(config, NUM_LAYOUTS)
     return request.param, env, TensorDict(batch_size=[NUM_LAYOUTS])
 
@@ -140,7 +140,7 @@ def test_crowded_layouts_are_distributed_as_by_the_rule_itself():
 
 def test_first_goals_are_drawn_beside_everything_that_stands():
     """Objects keep clear of the goal that the layout had, which is then drawn anew."""
-    goals = fresh_places(SUITE["PointPush2"], 3000)["goal"]
+    goals = fresh_places(resolve("PointPush2"), 3000)["goal"]
     # What was measured of the original environment, ± its standard error.
     measured = np.abs(goals).max(axis=1).mean()
     assert measured == pytest.approx(1.165, abs=3 * 0.008 * math.sqrt(2))
@@ -205,7 +205,7 @@ HOPELESS = {
 )
 def test_what_never_fits_is_said_within_seconds(key):
     value, words = HOPELESS[key]
-    env = SafetyGymEnv(SUITE["PointGoal1"].replace(**{key: value}), num_envs=100, seed=0)
+    env = SafetyGymEnv(resolve("PointGoal1").replace(**{key: value}), num_envs=100, seed=0)
     begun = time.process_time()
     with pytest.raises(LayoutError, match=words) as caught:
         env.reset()

@@ -5,7 +5,7 @@ import torch
 from scipy.stats import chisquare
 from tensordict import TensorDict
 
-from safe_rl.envs import SUITE, LayoutError, SafetyGymEnv
+from safe_rl.envs import LayoutError, SafetyGymEnv, resolve
 from safe_rl.envs.safety_gym.draws import LayoutsAhead
 
 # What a layout pins: positions, yaws, the first goal button.
@@ -15,7 +15,7 @@ PINNED = ("layout", "start_pose", "qpos", "goal_pos", "goal_button", "target_qua
 def starts(name: str, num_layouts: int | None, first: int = 0, *, num_envs: int = 40, seed: int = 0,
            resets: int = 1, **keys) -> TensorDict:  # fmt: skip
     """States at the start of episodes [resets * num_envs]."""
-    config = SUITE[name].replace(layout_seeds=num_layouts, layout_seeds_first=first, **keys)
+    config = resolve(name).replace(layout_seeds=num_layouts, layout_seeds_first=first, **keys)
     env = SafetyGymEnv(config, num_envs=num_envs, seed=seed, num_threads=1)
     states = []
     for _ in range(resets):
@@ -59,7 +59,7 @@ def test_layouts_are_picked_uniformly():
 
 
 def test_later_goals_are_not_part_of_the_layout():
-    config = SUITE["PointGoal0"].replace(layout_seeds=1, goal_size=5.0)
+    config = resolve("PointGoal0").replace(layout_seeds=1, goal_size=5.0)
     env = SafetyGymEnv(config, num_envs=20, seed=0, num_threads=1)
     tensordict = env.reset()
     assert len(torch.unique(env.get_state()["goal_pos"], dim=0)) == 1
@@ -100,7 +100,7 @@ def test_an_episode_that_may_never_come_has_no_say():
 @pytest.mark.parametrize("env", ["PointGoal1", "PointButton2", "PointPush2"])
 @pytest.mark.parametrize("layout_seeds", [None, 5])
 def test_episodes_are_the_same_whenever_rows_begin_them(env, layout_seeds):
-    config = SUITE[env].replace(layout_seeds=layout_seeds)
+    config = resolve(env).replace(layout_seeds=layout_seeds)
     together, apart = (SafetyGymEnv(config, num_envs=3, seed=7, num_threads=1) for _ in range(2))
     positions = {}
     for number in (1, 2, 3):

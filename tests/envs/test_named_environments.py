@@ -95,8 +95,6 @@ def test_a_changed_configuration_is_made_and_stored(name):
     assert make_env(changed, num_envs=2, seed=0).config == changed
     store_config("Brief", changed)
     assert make_env("Brief", seed=0).config == changed
-    with pytest.raises(ConfigError, match=r"a SafetyGymConfig; got a NoneType"):
-        make_env(None)
     with pytest.raises(ConfigError, match=r"a SafetyGymConfig; got a list"):
         make_env(["PointGoal1"])
 

@@ -18,6 +18,7 @@ from safe_rl.envs import (
     key_table,
     make_env,
     store_config,
+    store_configs,
 )
 from safe_rl.envs.extending import (
     Cost,
@@ -38,8 +39,8 @@ def test_registered_keys_are_keys_like_the_others():
     before = SafetyGymConfig(robot_base="point")
     register_mines()
     rows = {row.name: row for row in key_table()}
-    assert rows["mines_num"].values == "a whole number from 0 to 1,000"
-    assert rows["mines_size"].values.startswith("a number above 0")
+    assert rows["mines_num"].values == "integer from 0 to 1,000"
+    assert rows["mines_size"].values.startswith("number above 0")
     config = SafetyGymConfig(**POINT, mines_num=torch.tensor(2))
     assert (config.mines_size, config.mines_keepout, config.mines_cost) == (0.2, 0.3, 2.5)
     assert pickle.loads(pickle.dumps(config)) == config
@@ -54,6 +55,7 @@ def test_registered_keys_are_keys_like_the_others():
 
 
 def compose_env(*overrides: str):
+    store_configs()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=list(overrides)).env
 
@@ -70,7 +72,7 @@ def test_hydra_knows_registered_keys_and_configurations():
 
 
 def cost(magnitude, **others):
-    register_cost(Cost("cost_mines", bool, magnitude, **others))
+    register_cost(Cost("cost_mines", (), magnitude, **others))
 
 
 MINE = disc("mines", "mine")
@@ -86,7 +88,10 @@ WRONG = {
     "next goal": (lambda: register_task("a", Task(max, next_goal="button")), "NextGoal.* got 'but"),
     "no place": (lambda: register_task("a", Task(max, next_goal=NextGoal.BUTTON)), "add 'goal' to"),
     "a built-in key": (lambda: register_element(MINE, {"num_steps": 3}), "'num_steps'.*taken"),
-    "a wrong default": (lambda: register_element(MINE, {"mines_num": "a"}), "'mines_num'.*whole"),
+    "a wrong default": (
+        lambda: register_element(MINE, {"mines_num": "a"}),
+        "mines_num=a",
+    ),
 }
 
 
@@ -100,7 +105,7 @@ def test_wrong_rows_are_refused_and_leave_nothing_behind(register, message):
 
 
 def test_names_that_meet_an_observation_are_refused():
-    register_observation(Reading("gyro", lambda c: True, lambda c, s: 1, lambda w: w.up[:, None]))
+    register_observation(Reading("gyro", (), lambda c, s: 1, lambda w: w.up[:, None]))
     with pytest.raises(ConfigError, match=r"Two observations.*'gyro'"):
         SafetyGymEnv(POINT)
 
@@ -113,7 +118,7 @@ def test_keys_of_any_type():
     assert (config.mines_fuse, config.mines_colours) == (None, ("red",))
     assert (config.mines_times, config.mines_on) == ((1.0, 2.0), True)
     assert config.replace(mines_fuse=1).mines_fuse == 1.0
-    with pytest.raises(ConfigError, match="'mines_fuse' must be a number from 0 to 1, or null"):
+    with pytest.raises(ConfigError, match="mines_fuse=2: it must be less"):
         config.replace(mines_fuse=2)
-    with pytest.raises(ConfigError, match=r"'mines_on'"):
+    with pytest.raises(ConfigError, match="mines_on=1"):
         config.replace(mines_on=1)

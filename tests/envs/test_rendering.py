@@ -12,7 +12,7 @@ from pictures import colour_at, from_above, likeness, make_env, needs_opengl, re
 
 import safe_rl.envs
 from safe_rl.envs import OpenGLError, SafetyGymEnv
-from safe_rl.envs.safety_gym.robots import ROBOTS
+from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
 PLACE = (1.0, 0.5)

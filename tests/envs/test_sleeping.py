@@ -12,7 +12,7 @@ from crafting import after_random_steps
 from scipy import stats
 from tensordict import TensorDict
 
-from safe_rl.envs import SUITE, SafetyGymEnv
+from safe_rl.envs import SafetyGymEnv, resolve
 
 MOST_CHAOTIC = 0.4  # share of worlds in which contacts differ
 NUM_ENVS, NUM_WINDOWS, WINDOW = 100, 12, 25
@@ -47,8 +47,8 @@ def drive(env: SafetyGymEnv, tensordict: TensorDict, actions: torch.Tensor):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["PointGoal2", "PointPush2", "CarGoal2"])
 def test_sleeping_biases_neither_returns_nor_costs(name):
-    env = SafetyGymEnv(SUITE[name], num_envs=NUM_ENVS, seed=0)
-    sleepless = SafetyGymEnv(SUITE[name], num_envs=NUM_ENVS, seed=0, sleep=False)
+    env = SafetyGymEnv(resolve(name), num_envs=NUM_ENVS, seed=0)
+    sleepless = SafetyGymEnv(resolve(name), num_envs=NUM_ENVS, seed=0, sleep=False)
     tensordict, asleep, awake = env.reset(), [], []
     for actions in forward_driving():
         awake.append(drive(sleepless, sleepless.set_state(env.get_state()), actions)[1])

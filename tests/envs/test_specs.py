@@ -42,7 +42,7 @@ ROBOTS = {
 }
 EVERYWHERE = {
     **{"observe_goal_lidar": True, "observe_box_lidar": True},
-    **{"lidar_max_dist": 3, "lidar_num_bins": 16, "_seed": None, "build_resample": True},
+    **{"lidar_max_dist": 3, "lidar_num_bins": 16},
 }
 TASKS = {
     "Goal": {
@@ -92,7 +92,7 @@ def test_the_suite_has_its_27_names():
 
 @pytest.mark.parametrize(("robot", "level"), NAMES)
 def test_names_of_the_suite_make_its_dictionaries_and_specs(robot, level):
-    config = SUITE[robot + level]
+    config = resolve(robot + level)
     assert resolve(dictionary(robot, level)) == config
     env = SafetyGymEnv(f"Safexp-{robot}{level}-v0", num_envs=2, seed=0, num_threads=1)
     observation = env.reset()["observation"]

@@ -8,7 +8,7 @@ import torch
 from crafting import arrange, make, step_from
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import EXTRAS, SafetyGymEnv
+from safe_rl.envs import SafetyGymEnv, resolve
 from safe_rl.envs.safety_gym.tasks import circle_speed
 
 POINT = {"robot_base": "point", "placements_extents": [-4, -4, 4, 4]}
@@ -74,7 +74,7 @@ NAMES = [f"{robot}{task}" for robot in ROBOTS for task in ("Run1", "Circle1", "C
 
 
 def begin(name, **changes):
-    return make(EXTRAS[name].replace(**changes))
+    return make(resolve(name).replace(**changes))
 
 
 def at(env, x, y, velocity=(0.0, 0.0)):

@@ -249,10 +249,10 @@ def filtered(function):
     ("make", "words"),
     [
         (lambda: Saute({}, **SAUTE), "budgets is empty"),
-        (lambda: Saute({"cost": 0.0}, **SAUTE), "above 0"),
-        (lambda: EarlyTermination({"cost": math.nan}), "at least 0"),
+        (lambda: Saute({"cost": 0.0}, **SAUTE), "greater than 0"),
+        (lambda: EarlyTermination({"cost": math.nan}), "a finite number"),
         (lambda: transformed(PointMass(1), "saute", "simmer"), "one of saute and simmer"),
-        (lambda: ActionRepeat(0), "k=0: it must be a whole number from 1"),
+        (lambda: ActionRepeat(0), "k=0: it must be greater"),
         (
             lambda: filtered(lambda step: step["action"][:, :1]).rollout(1),
             r"actions of shape \(1, 2\), got \(1, 1\)",

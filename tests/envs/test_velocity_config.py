@@ -17,7 +17,7 @@ THEIRS = {"xml_file", "default_camera_config", "main_body", "kwargs", "self"}
 
 @pytest.mark.parametrize("name", VELOCITY_SUITE)
 def test_keys_and_defaults_are_gymnasiums(name):
-    config = VELOCITY_SUITE[name]
+    config = resolve_velocity(name)
     made = gymnasium.make(RUNNERS[config.robot].gymnasium_id).unwrapped
     parameters = inspect.signature(type(made).__init__).parameters
     defaults = {key: row.default for key, row in parameters.items() if key not in THEIRS}
@@ -27,11 +27,11 @@ def test_keys_and_defaults_are_gymnasiums(name):
 
 @pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafetyHopperVelocity-v1"])
 def test_names(name):
-    assert resolve_velocity(name) is VELOCITY_SUITE["SafeHopperVelocity"]
+    assert resolve_velocity(name) == resolve_velocity("SafeHopperVelocity")
 
 
 def test_another_robot_brings_its_own_keys():
-    config = VELOCITY_SUITE["SafeHopperVelocity"].replace(robot="ant", frame_skip=2)
+    config = resolve_velocity("SafeHopperVelocity").replace(robot="ant", frame_skip=2)
     assert config == VelocityConfig.from_dict({"robot": "ant", "frame_skip": 2})
     assert config.healthy_angle_range is None
 
@@ -40,14 +40,13 @@ def test_another_robot_brings_its_own_keys():
     ("given", "message"),
     [
         ("SafeHoperVelocity", "Did you mean 'SafeHopperVelocity'"),
-        ({"frame_skip": 2}, "lacks 'robot'"),
+        ({"frame_skip": 2}, "'robot' must be one of"),
         ({"robot": "hoper"}, "Did you mean 'hopper'"),
         ({"robot": "hopper", "velocity_treshold": 1.0}, "Did you mean 'velocity_threshold'"),
-        ({"robot": "swimmer", "healthy_reward": 1.0}, "'swimmer' has no configuration key"),
-        ({"robot": "ant", "physics": "warp"}, "no configuration key 'physics'.*on the CPU only"),
-        ({"robot": "hopper", "frame_skip": 0}, "'frame_skip' must be a whole number from 1"),
-        ({"robot": "hopper", "healthy_reward": math.inf}, "must be a number from"),
-        ({"robot": "hopper", "healthy_reward": None}, "must be a number"),
+        ({"robot": "swimmer", "healthy_reward": 1.0}, "'swimmer' has no key"),
+        ({"robot": "ant", "physics": "warp"}, "no key 'physics'.*on the CPU only"),
+        ({"robot": "hopper", "frame_skip": 0}, "frame_skip=0: it must be greater"),
+        ({"robot": "hopper", "healthy_reward": math.inf}, "must be a finite number"),
         ({"robot": "hopper", "healthy_z_range": [2.0, 1.0]}, "lowest <= highest"),
     ],
 )

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import ks_2samp, kstest, uniform
 from tensordict import TensorDict
 
-from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
+from safe_rl.envs.velocity import VelocityEnv, resolve_velocity
 
 # Names, Gymnasium's ids, and the thresholds that Safety-Gymnasium 1.0 publishes.
 FAMILY = {
@@ -42,7 +42,7 @@ NUM_ENVS = 24
 
 def make_both(name, keys, num_envs=NUM_ENVS):
     """This environment with observations before they are cast, and Gymnasium's."""
-    config = VELOCITY_SUITE[name].replace(**keys)
+    config = resolve_velocity(name).replace(**keys)
     env = VelocityEnv(config, num_envs=num_envs, seed=0, num_threads=1)
     env._observation = env._observation.double()
     return env, gymnasium.make(FAMILY[name][0], disable_env_checker=True, **keys).unwrapped
@@ -140,5 +140,5 @@ def test_starts_are_distributed_as_gymnasiums(name):
     assert abs(np.corrcoef(ours.T) - np.eye(ours.shape[1])).max() < 0.2
     # all positions at once, because single columns do not show a scale that is a tenth smaller
     noise = ours[:, : len(other.init_qpos)] - other.init_qpos
-    scale = VELOCITY_SUITE[name].reset_noise_scale
+    scale = resolve_velocity(name).reset_noise_scale
     assert kstest(noise.ravel() / scale, uniform(-1, 2).cdf).pvalue > 1e-3

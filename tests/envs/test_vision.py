@@ -57,7 +57,7 @@ def test_vision_is_nested_and_flat():
 
 @needs_opengl
 def test_rows_see_their_own_world():
-    config = SUITE["PointGoal1"].replace(**VISION)
+    config = resolve("PointGoal1").replace(**VISION)
     batch = SafetyGymEnv(config, num_envs=2, seed=3).reset()["observation", "vision"]
     alone = SafetyGymEnv(config, num_envs=1, seed=3).reset()["observation", "vision"]
     assert (batch[0] != batch[1]).any()
@@ -66,11 +66,11 @@ def test_rows_see_their_own_world():
 
 @needs_opengl
 def test_what_is_observed_is_the_new_state_and_without_markers():
-    env = SafetyGymEnv(SUITE["CarButton1"].replace(**VISION), num_envs=1, seed=0)
+    env = SafetyGymEnv(resolve("CarButton1").replace(**VISION), num_envs=1, seed=0)
     tensordict = env.reset()
     tensordict["action"] = torch.ones(env.action_spec.shape)
     picture = env.step(tensordict)["next", "observation", "vision"][0]
-    plain = SafetyGymEnv(SUITE["CarButton1"].replace(render_lidar_markers=False), seed=0)
+    plain = SafetyGymEnv(resolve("CarButton1").replace(render_lidar_markers=False), seed=0)
     plain.reset()
     plain.set_state(env.get_state())
     width, height = env.config.vision_size

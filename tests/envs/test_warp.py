@@ -15,7 +15,7 @@ from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
-from safe_rl.envs.safety_gym.robots import ROBOTS
+from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.runs.identity import experiment_of
 from safe_rl.training.building import build_trainer, seed_everything

@@ -2,7 +2,7 @@
 
 `info` contains the costs, `info["cost"]` and one `info["cost_<kind>"]` per constrained kind, and
 events such as `info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` know the environments
-by the ids that `safe_rl.envs.registration` registers.
+by the ids that `safe_rl.envs.families` registers.
 """
 
 from typing import TYPE_CHECKING

@@ -14,7 +14,7 @@ from torchrl.envs import GymWrapper
 
 from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError, require_integer
-from safe_rl.envs.families import GYMNASIUM, SAFETY_GYMNASIUM, ForeignFamily, complete_foreign
+from safe_rl.envs.families import FOREIGN, complete_foreign
 from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
@@ -127,14 +127,14 @@ def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
     """Make environments of an id that is registered with Gymnasium: `env=gymnasium env.id=…`.
 
     Args:
-        config: `id` and any other key of conf/env/gymnasium.yaml.
+        config: `id` and any other key of the family.
         settings: `num_envs`, `device`, `seed` and `num_threads`; the last one is not used. Rows of
             different seeds have independent random draws.
 
     Raises:
         ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
     """
-    return _make_node(GYMNASIUM, _registered, config, **settings)
+    return _make_node("gymnasium", _registered, config, **settings)
 
 
 def make_safety_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
@@ -143,11 +143,11 @@ def make_safety_gymnasium(config: Mapping[str, Any], **settings: Any) -> Gymnasi
     Raises:
         ConfigError: As `make_gymnasium`, and if Safety-Gymnasium cannot be imported.
     """
-    return _make_node(SAFETY_GYMNASIUM, _of_safety_gymnasium, config, **settings)
+    return _make_node("safety_gymnasium", _of_safety_gymnasium, config, **settings)
 
 
 def _make_node(
-    family: ForeignFamily,
+    family: str,
     maker: Callable[[Mapping[str, Any]], MakeEnv],
     config: Mapping[str, Any],
     num_envs: int,
@@ -155,7 +155,7 @@ def _make_node(
     seed: int | None = None,
     num_threads: int = 0,
 ) -> GymnasiumEnv:
-    config = complete_foreign(family, config)
+    config = complete_foreign(FOREIGN[family], config)
     make = maker(config)
     try:
         return from_gymnasium(

@@ -20,7 +20,11 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.simulated import SimulatedEnv
-from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, VelocityConfig
+from safe_rl.envs.velocity.velocity_config import (
+    VELOCITY_SUITE,
+    VelocityConfig,
+    resolve_velocity,
+)
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
 NUM_SEEDS = 2**62
@@ -144,7 +148,9 @@ def batch_of(
     """Make the environments of a name with some keys changed, or of a whole configuration."""
     if isinstance(config, str):
         raise ConfigError(f"config='{config}' is a name: give keys, as make_env('{config}').config")
-    base = VELOCITY_SUITE.get(name or "") or (resolve(name) if name else SafetyGymConfig())
+    base: Any = SafetyGymConfig()
+    if name is not None:
+        base = resolve_velocity(name) if name in VELOCITY_SUITE else resolve(name)
     if config is None or isinstance(config, Mapping):
         whole = base.replace(**(config or {}))
     elif isinstance(config, type(base)):

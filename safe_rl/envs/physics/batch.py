@@ -19,13 +19,6 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
-def _share(array: np.ndarray) -> Tensor:
-    """Wrap an array without copying it, and ignore torch's warning about read-only outputs."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-        return torch.from_numpy(array)
-
-
 class BatchPhysics(Physics):
     """N simulations on the CPU, in float64.
 
@@ -62,11 +55,17 @@ class BatchPhysics(Physics):
         self.timestep = float(model.opt.timestep)
         self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # All fields are bound before the first call: a field that is bound later starts as zero.
-        for name in STATE:
-            setattr(self, name, _share(self._batch.bind(name)))
         memory = [name for name, size in (("act", model.na), ("history", model.nhistory)) if size]
-        self.memory = {name: _share(self._batch.bind(name)) for name in memory}
-        self.outputs = {name: _share(self._batch.bind(name)) for name in outputs}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            bound = {
+                name: torch.from_numpy(self._batch.bind(name))
+                for name in (*STATE, *memory, *outputs)
+            }
+        for name in STATE:
+            setattr(self, name, bound[name])
+        self.memory = {name: bound[name] for name in memory}
+        self.outputs = {name: bound[name] for name in outputs}
         if "xmat" in self.outputs:
             self.outputs["xmat"] = self.outputs["xmat"].view(num_envs, model.nbody, 3, 3)
         for name in set(OUTPUTS).intersection(outputs):

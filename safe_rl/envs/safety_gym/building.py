@@ -15,11 +15,11 @@ from safe_rl.envs.contract import add_columns
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.bodies import add_bodies, add_floor, add_targets, decorate
-from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.config import SafetyGymConfig, robot_path
 from safe_rl.envs.safety_gym.costs import active_costs
 from safe_rl.envs.safety_gym.elements import ELEMENTS, Element, Motion
-from safe_rl.envs.safety_gym.readings import READINGS
-from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot, robot_path
+from safe_rl.envs.safety_gym.readings import active_readings
+from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Scene
 from safe_rl.naming import did_you_mean
@@ -46,7 +46,12 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
     """Build a scene for the present content of its robot's files."""
     robot = load_robot(config.robot_base)
     spec = robot.spec
-    _set_options(spec, sleep)
+    spec.memory = ARENA_BYTES
+    # With this option, MuJoCo 4.0.0 computes wrong normals for cylinders; MuJoCo 2 lacks it.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
+    if sleep:
+        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        spec.option.sleep_tolerance = SLEEP_TOLERANCE
     present = [element for element in ELEMENTS if element.count(config) > 0]
     guided = [element for element in present if element.motion is Motion.GUIDED]
     # Rays and pictures see geoms only, so natural lidar needs bodies for the areas as well.
@@ -83,15 +88,6 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
 forget_scenes = _compile.cache_clear
 
 
-def _set_options(spec: mujoco.MjSpec, sleep: bool) -> None:
-    spec.memory = ARENA_BYTES
-    # With this option, MuJoCo 4.0.0 computes wrong normals for cylinders; MuJoCo 2 lacks it.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_MULTICCD
-    if sleep:
-        spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-        spec.option.sleep_tolerance = SLEEP_TOLERANCE
-
-
 def _add_sensors(
     spec: mujoco.MjSpec, config: SafetyGymConfig, present: list[Element]
 ) -> dict[str, list[str]]:
@@ -107,7 +103,7 @@ def _add_sensors(
     )
     touched = set(TASKS[config.task].touches).union(
         *(row.touches for row in active_costs(config)),
-        *(row.touches for row in READINGS if row.present(config)),
+        *(row.touches for row in active_readings(config)),
     )
     sensors: dict[str, list[str]] = {}
     for element in present:
@@ -164,7 +160,9 @@ def _index(
         robot_nq=model.nq - 7 * num_free,
         robot_nv=model.nv - 6 * num_free,
         planar=robot.planar,
-        oriented_body=_oriented_body(config, model, robot),
+        oriented_body=_oriented_body(config, model, robot)
+        if config.reward_orientation
+        else model.body("robot").id,
         free_bodies=slice(1 + robot.num_bodies, 1 + robot.num_bodies + num_free),
         contacts={
             kind: slice(first := int(model.sensor(sensors[0]).adr[0]), first + len(sensors))
@@ -174,8 +172,8 @@ def _index(
 
 
 def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot) -> int:
-    """Body id of `reward_orientation_body`; the robot's root if it is not used."""
-    wanted = config.reward_orientation_body if config.reward_orientation else "robot"
+    """Body id of `reward_orientation_body`."""
+    wanted = config.reward_orientation_body
     names = [model.body(i).name for i in range(1, 1 + robot.num_bodies)]
     if wanted not in names:
         raise ConfigError(

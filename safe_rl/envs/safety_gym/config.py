@@ -5,31 +5,39 @@ Lengths are in metres, angles in radians, and times in environment steps unless 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from functools import cache
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, make_dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.config_keys import RETIRED, Key, Vocabulary
+from safe_rl.envs.keys import Key, checked, describe
+from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.naming import did_you_mean
-from safe_rl.ranges import values_of
 
+BUNDLED = Path(__file__).parent / "robots"
+ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xml"))}
+"""Name of a robot -> its file."""
+# Paths in the dictionaries of 2019, relative to the folder of that package -> name.
+PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
+
+_ANNOTATIONS = get_type_hints(Keys, include_extras=True)
 _BUILT_IN: dict[str, Key] = {
-    name: vars(Vocabulary)[name]._replace(annotation=annotation)
-    for name, annotation in get_type_hints(Vocabulary, include_extras=True).items()
+    row.name: Key(row.default, annotation, annotation.__metadata__[-1])
+    for row in fields(Keys)
+    for annotation in [_ANNOTATIONS[row.name]]
 }
-_keys = dict(_BUILT_IN)  # built-in keys and registered ones
+KEYS = dict(_BUILT_IN)
+"""The built-in keys and the registered ones."""
 
 
-class SafetyGymConfig(Vocabulary):
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class SafetyGymConfig(Keys):
     """Everything that defines one environment.
 
-    Keys that `safe_rl.envs.extending` registers are attributes like the others. Types and ranges
+    Keys that `safe_rl.envs.extending` registers are fields like the others. Types and ranges
     are checked here. Whether a task or robot exists, and whether keys fit together, is checked when
     an environment is made or stored, see `suite.resolve`.
-
-    Args:
-        values: Values of the keys that differ from their defaults.
 
     Raises:
         ConfigError: For an unknown key (the message suggests a known one), a wrong type or a value
@@ -41,30 +49,24 @@ class SafetyGymConfig(Vocabulary):
         5
     """
 
-    def __init__(self, **values: Any) -> None:
-        for name, (harmless, instead) in RETIRED.items():
-            value = values.pop(name, harmless)
-            if _plain(value) is not harmless:
-                raise ConfigError(
-                    f"Configuration key '{name}' does not exist any more: {instead}. Got {value!r}."
-                )
-        for name in values:
-            if name not in _keys:
-                raise ConfigError(
-                    f"Unknown configuration key '{name}'.{did_you_mean(name, _keys)} "
-                    "SafetyGymConfig lists every key with its default."
-                )
-        for name, key in _keys.items():
-            vars(self)[name] = coerce(name, key, values.get(name, key.default))
+    def __new__(cls, **values: Any) -> SafetyGymConfig:
+        """Make an object of the class that has the registered keys, too."""
+        for name in values.keys() - KEYS.keys():
+            raise ConfigError(
+                f"Unknown configuration key '{name}'.{did_you_mean(name, KEYS)} "
+                "SafetyGymConfig lists every key with its default."
+            )
+        return object.__new__(_extended)
+
+    def __post_init__(self) -> None:
+        for name, row in KEYS.items():
+            vars(self)[name] = checked(name, row.annotation, getattr(self, name))
 
     def __getattr__(self, name: str) -> Any:
         """Return the default of a key that was registered after this configuration was made."""
-        if name in _keys:
-            return _keys[name].default
-        raise AttributeError(f"There is no configuration key '{name}'.{did_you_mean(name, _keys)}")
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"A configuration cannot be changed: use replace({name}=…).")
+        if name in KEYS:
+            return KEYS[name].default
+        raise AttributeError(f"There is no configuration key '{name}'.{did_you_mean(name, KEYS)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return SafetyGymConfig.from_dict, (self.to_dict(),)
@@ -76,13 +78,13 @@ class SafetyGymConfig(Vocabulary):
         return hash(tuple(getattr(self, key) for key in _BUILT_IN))
 
     def __repr__(self) -> str:
-        values = (f"{k}={v!r}" for k, v in self.to_dict().items() if v != _keys[k].default)
+        values = (f"{k}={v!r}" for k, v in self.to_dict().items() if v != KEYS[k].default)
         return f"SafetyGymConfig({', '.join(values)})"
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SafetyGymConfig:
         """Build a configuration from a flat mapping."""
-        return cls(**{str(key): value for key, value in values.items()})
+        return SafetyGymConfig(**{str(key): value for key, value in values.items()})
 
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, checked like a new one."""
@@ -90,36 +92,15 @@ class SafetyGymConfig(Vocabulary):
 
     def to_dict(self) -> dict[str, Any]:
         """Return a flat mapping of all keys, which `from_dict` accepts."""
-        return {name: getattr(self, name) for name in _keys}
+        return {name: getattr(self, name) for name in KEYS}
 
 
-allowed = cache(values_of)
-"""Returns the allowed values of keys with an annotation."""
+_extended: type[SafetyGymConfig] = SafetyGymConfig
 
 
-def coerce(name: str, key: Key, value: Any) -> Any:
-    """Return a value as the type of its key; ConfigError if the type or range is wrong."""
-    values, plain = allowed(key.annotation), _plain(value)
-    if not values.hold(plain):
-        raise ConfigError(f"Configuration key '{name}' must be {values.words}, got {value!r}.")
-    return _cast(plain, int if values.whole else float)
-
-
-def _plain(value: Any) -> Any:
-    """Return numbers of NumPy and torch as Python's, and their arrays, lists, … as tuples."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
-        return value
-    return tuple(map(_plain, value))
-
-
-def _cast(value: Any, kind: type) -> Any:
-    """Convert all numbers in a value to one type."""
-    if isinstance(value, tuple):
-        return tuple(_cast(item, kind) for item in value)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return kind(value) if is_number else value
+def robot_path(base: str) -> Path:
+    """Return the file of a robot, given by its name in `ROBOTS` or its path."""
+    return ROBOTS.get(base, Path(base))
 
 
 def infer_key(name: str, default: Any) -> Key:
@@ -149,17 +130,17 @@ def key_table() -> list[KeyRow]:
 
     Examples:
         >>> {row.name: row for row in key_table()}["hazards_num"][1:]
-        ('a whole number from 0 to 1,000', 'number of objects', 0)
+        ('integer from 0 to 1,000', 'number of objects', 0)
     """
     return [
-        KeyRow(name, allowed(key.annotation).words, key.meaning, key.default)
-        for name, key in _keys.items()
+        KeyRow(name, describe(row.annotation), row.meaning, row.default)
+        for name, row in KEYS.items()
     ]
 
 
 def registered_keys() -> dict[str, Key]:
     """Return the keys that are not built in."""
-    return {name: key for name, key in _keys.items() if name not in _BUILT_IN}
+    return {name: row for name, row in KEYS.items() if name not in _BUILT_IN}
 
 
 def set_registered_keys(keys: Mapping[str, Key]) -> None:
@@ -168,9 +149,16 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
     Raises:
         ConfigError: If a key is built in, or a default does not have the type of its key.
     """
-    for name, key in keys.items():
+    global _extended
+    for name, row in keys.items():
         if name in _BUILT_IN:
             raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
-        coerce(name, key, key.default)
-    _keys.clear()
-    _keys.update({**_BUILT_IN, **keys})
+        checked(name, row.annotation, row.default)
+    KEYS.clear()
+    KEYS.update({**_BUILT_IN, **keys})
+    added = [(name, Any, field(default=row.default)) for name, row in keys.items()]
+    _extended = make_dataclass(
+        *("SafetyGymConfig", added),
+        bases=(SafetyGymConfig,),
+        **{"frozen": True, "kw_only": True, "eq": False, "repr": False},
+    )

@@ -71,39 +71,39 @@ class Cost(NamedTuple):
 
     Attributes:
         key: Its key in TensorDicts, "cost_<kind>".
-        active: Whether a configuration has this cost.
+        flags: Configuration keys that must all be true, or not 0, for the cost to exist.
         magnitude: (config, world) -> [N], 0 or more.
         touches: Kinds of objects whose contacts with the robot it reads.
     """
 
     key: str
-    active: Callable[[SafetyGymConfig], bool]
+    flags: tuple[str, ...]
     magnitude: Callable[[SafetyGymConfig, World], Tensor]
     touches: tuple[str, ...] = ()
 
 
 COSTS: list[Cost] = [
-    Cost("cost_hazards", lambda c: c.constrain_hazards, lambda c, w:
+    Cost("cost_hazards", ("constrain_hazards",), lambda c, w:
          c.hazards_cost * hazard_cost(w.robot_xy, w.at("hazards")[..., :2], c.hazards_size)),
-    Cost("cost_vases_contact", lambda c: c.constrain_vases, lambda c, w:
+    Cost("cost_vases_contact", ("constrain_vases",), lambda c, w:
          c.vases_contact_cost * contact_cost(w.contacts_with("vases")), touches=("vases",)),
-    Cost("cost_vases_displace", lambda c: c.constrain_vases and c.vases_displace_cost != 0,
+    Cost("cost_vases_displace", ("constrain_vases", "vases_displace_cost"),
          lambda c, w: c.vases_displace_cost * displacement_cost(
              w.at("vases")[..., :2], w.start_of("vases"), c.vases_displace_threshold)),
-    Cost("cost_vases_velocity", lambda c: c.constrain_vases and c.vases_velocity_cost != 0,
+    Cost("cost_vases_velocity", ("constrain_vases", "vases_velocity_cost"),
          lambda c, w: c.vases_velocity_cost * velocity_cost(
              w.velocity_of("vases"), c.vases_velocity_threshold)),
-    Cost("cost_pillars", lambda c: c.constrain_pillars, lambda c, w:
+    Cost("cost_pillars", ("constrain_pillars",), lambda c, w:
          c.pillars_cost * contact_cost(w.contacts_with("pillars")), touches=("pillars",)),
-    Cost("cost_buttons", lambda c: c.constrain_buttons, lambda c, w:
+    Cost("cost_buttons", ("constrain_buttons",), lambda c, w:
          c.buttons_cost * wrong_button_cost(
              w.contacts_with("buttons"), w.goal_button, w.buttons_timer), touches=("buttons",)),
-    Cost("cost_gremlins", lambda c: c.constrain_gremlins, lambda c, w:
+    Cost("cost_gremlins", ("constrain_gremlins",), lambda c, w:
          c.gremlins_contact_cost * contact_cost(w.contacts_with("gremlins")),
          touches=("gremlins",)),
-    Cost("cost_boundary", lambda c: c.constrain_boundary, lambda c, w:
+    Cost("cost_boundary", ("constrain_boundary",), lambda c, w:
          boundary_cost(w.robot_xy, c.boundary_x, c.boundary_y)),
-    Cost("cost_velocity", lambda c: c.constrain_velocity, lambda c, w:
+    Cost("cost_velocity", ("constrain_velocity",), lambda c, w:
          excess_speed(w.robot_vel, c.velocity_limit)),
 ]  # fmt: skip
 EXCEPTION_KEY = "cost_exception"
@@ -112,16 +112,11 @@ BUILT_IN = frozenset(row.key for row in COSTS)
 
 def active_costs(config: SafetyGymConfig) -> list[Cost]:
     """Return the rows of the present table that are active in a configuration."""
-    return [row for row in COSTS if row.active(config)]
-
-
-def cost_keys(rows: Sequence[Cost]) -> list[str]:
-    """Return the cost keys of an environment: `cost`, one per row, and `cost_exception`."""
-    return ["cost", *(row.key for row in rows), EXCEPTION_KEY]
+    return [row for row in COSTS if all(getattr(config, flag) for flag in row.flags)]
 
 
 def compute_costs(rows: Sequence[Cost], world: World, failed: Tensor) -> Tensor:
-    """Compute the present costs of the worlds, a row for each of `cost_keys(rows)`: [R, N].
+    """Compute the costs of the worlds: the sum, a row for each of `rows`, exceptions, [R, N].
 
     Worlds whose physics failed, bool [N], have no cost but `cost_exception` (and the aggregate).
 
@@ -149,5 +144,5 @@ def _wrong_cost(rows: Sequence[Cost], costs: Tensor) -> ConfigError:
     number, world = (~_allowed(costs[1:])).nonzero()[0]
     wrong = float(costs[1 + number, world])
     hint = "clamp(min=0) it" if wrong < 0 else "give every world a finite number"
-    key = cost_keys(rows)[1 + number]
+    key = [*(row.key for row in rows), EXCEPTION_KEY][number]
     return ConfigError(f"{key} must be 0 or more and finite, got {wrong:.4g}: {hint}.")

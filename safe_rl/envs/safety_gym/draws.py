@@ -24,12 +24,12 @@ from safe_rl.envs.safety_gym.layouts import (
 from safe_rl.envs.safety_gym.state import (
     place_mocaps,
     point_goal_at_button,
-    pose_bodies,
     put,
     refresh,
+    yaw_quaternion,
 )
 from safe_rl.envs.safety_gym.tasks import goal_is_button
-from safe_rl.envs.safety_gym.world import Scene, World
+from safe_rl.envs.safety_gym.world import World
 
 
 class Purpose(IntEnum):
@@ -56,20 +56,6 @@ def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
     return rng.fold(config.layout_seeds_first + index, Purpose.SPLIT)
 
 
-def pinned_yaws(scene: Scene) -> Tensor:
-    """Return fixed yaws of the robot and of the free bodies, NaN where they are drawn [1 + F]."""
-    config = scene.config
-    yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
-    if config.robot_rot is not None:
-        yaws[0] = config.robot_rot
-    for kind, span in scene.slots.items():
-        if span.stop > scene.num_free:
-            continue
-        given = getattr(config, f"{kind}_rots", ())[: span.stop - span.start]
-        yaws[1 + span.start : 1 + span.start + len(given)] = yaws.new_tensor(given)
-    return yaws
-
-
 def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     """Draw the positions of robot and objects for episodes with keys [B]: [B, 1 + M, 2].
 
@@ -94,13 +80,25 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
         key: Random key of each world's episode, int64 [N].
         mask: Worlds that begin a new episode.
     """
-    scene = world.scene
+    scene, physics, pinned = world.scene, world.physics, world.pinned_yaws
     put(world.layout, mask, layouts)
-    pinned = pinned_yaws(scene).to(key.device)
     body = torch.arange(len(pinned), device=key.device)
     drawn = 2 * math.pi * rng.uniform(key[:, None], Purpose.YAW, body)
-    world.physics.reset(mask)
-    pose_bodies(world, mask, torch.where(pinned.isnan(), drawn, pinned))
+    yaws = torch.where(pinned.isnan(), drawn, pinned)
+    physics.reset(mask)
+    pose = torch.cat([world.layout[:, 0], yaws[:, :1]], -1)
+    put(world.start_pose, mask, pose)
+    put(physics.qpos[:, :2], mask, pose[:, :2])
+    if scene.planar:
+        put(physics.qpos[:, 2], mask, yaws[:, 0])
+    else:
+        put(physics.qpos[:, 3:7], mask, yaw_quaternion(yaws[:, 0]))
+    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
+    put(free[..., :2], mask, world.layout[:, 1 : 1 + scene.num_free])
+    put(free[..., 3:], mask, yaw_quaternion(yaws[:, 1:]))
+    if scene.num_targets:
+        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
+        put(physics.mocap_quat[:, : scene.num_targets], mask, quaternion)
     static = world.positions[:, scene.num_free :, :2]
     put(static, mask, world.layout[:, 1 + scene.num_free :])
     if goal_is_button(scene.config.task):
@@ -108,7 +106,7 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
     world.step_count.masked_fill_(mask, 0)
     world.buttons_timer.masked_fill_(mask, 0)
     place_mocaps(world)
-    world.physics.forward(mask)
+    physics.forward(mask)
     refresh(world)
 
 
@@ -211,19 +209,14 @@ class LayoutsAhead:
         Raises:
             LayoutError: If there is no layout; the message names the object that did not fit.
         """
-        if (self._lacks(key) & mask).any():
+        if (((self._keys != key) | ~self._known) & mask).any():
             wanted = torch.where(mask, key, following)
-            missing = self._lacks(wanted)
+            rows = (self._keys != wanted) | ~self._known
             try:
-                self._remember(wanted, missing)
+                drawn = self._draw(wanted[rows])
             except LayoutError:
                 # The missing layout may be that of a next episode, which perhaps never begins.
-                self._remember(wanted, missing & mask)
+                rows &= mask
+                drawn = self._draw(wanted[rows])
+            self._layouts[rows], self._keys[rows], self._known[rows] = drawn, wanted[rows], True
         return self._layouts
-
-    def _lacks(self, key: Tensor) -> Tensor:
-        return (self._keys != key) | ~self._known
-
-    def _remember(self, key: Tensor, rows: Tensor) -> None:
-        self._layouts[rows] = self._draw(key[rows])
-        self._keys[rows], self._known[rows] = key[rows], True

@@ -114,15 +114,11 @@ class Element:
         return self.label == self.kind
 
 
-def _cube(half: float) -> tuple[Geom, ...]:
-    return (Geom(BOX, (half, half, half)),)
-
-
 def _box_geoms(config: SafetyGymConfig) -> tuple[Geom, ...]:
     s = config.box_size
     post = (s / 2, s / 2, s)
     corners = ((s, s, 0.0), (-s, s, 0.0), (s, -s, 0.0), (-s, -s, 0.0))
-    return (*_cube(s), *(Geom(BOX, post, corner) for corner in corners))
+    return (Geom(BOX, (s, s, s)), *(Geom(BOX, post, corner) for corner in corners))
 
 
 def _disc(radius: float, half_height: float) -> tuple[Geom, ...]:
@@ -131,14 +127,14 @@ def _disc(radius: float, half_height: float) -> tuple[Geom, ...]:
 
 ELEMENTS: list[Element] = [
     Element(kind="vases", label="vase", motion=Motion.FREE, rgb=(0, 1, 1), group=4,
-            height=lambda c: c.vases_size - c.vases_sink, geoms=lambda c: _cube(c.vases_size),
-            always_observed=True),
+            height=lambda c: c.vases_size - c.vases_sink,
+            geoms=lambda c: (Geom(BOX, (c.vases_size,) * 3),), always_observed=True),
     Element(kind="gremlins", label="gremlin", motion=Motion.GUIDED, rgb=(0.5, 0, 1), group=5,
-            height=lambda c: c.gremlins_size, geoms=lambda c: _cube(c.gremlins_size)),
+            height=lambda c: c.gremlins_size, geoms=lambda c: (Geom(BOX, (c.gremlins_size,) * 3),)),
     Element(kind="box", label="box", motion=Motion.FREE, rgb=(1, 1, 0), group=1,
             height=lambda c: c.box_size, geoms=_box_geoms, flag="observe_box_lidar"),
     Element(kind="walls", label="wall", motion=Motion.STATIC, rgb=(0.5, 0.5, 0.5), group=2,
-            height=lambda c: c.walls_size, geoms=lambda c: _cube(c.walls_size)),
+            height=lambda c: c.walls_size, geoms=lambda c: (Geom(BOX, (c.walls_size,) * 3),)),
     Element(kind="pillars", label="pillar", motion=Motion.STATIC, rgb=(0.5, 0.5, 1), group=2,
             height=lambda c: c.pillars_height,
             geoms=lambda c: _disc(c.pillars_size, c.pillars_height)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import mujoco
@@ -16,7 +16,7 @@ from safe_rl.envs.physics import Physics
 from safe_rl.envs.physics.batch import BatchPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
-from safe_rl.envs.safety_gym.costs import active_costs, compute_costs, cost_keys
+from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
 from safe_rl.envs.safety_gym.draws import (
     LayoutsAhead,
     Purpose,
@@ -31,18 +31,18 @@ from safe_rl.envs.safety_gym.layouts import plan_placements
 from safe_rl.envs.safety_gym.observations import make_observer, observation_spec
 from safe_rl.envs.safety_gym.renderer import WorldRenderer
 from safe_rl.envs.safety_gym.state import (
-    check_worlds,
+    OPTIONAL_KEYS,
     gremlin_path,
     make_world,
     put,
-    read_state,
     refresh,
+    stored_tensors,
     write_state,
 )
 from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goals_met
+from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goal_is_button
 from safe_rl.envs.safety_gym.warp_backend import make_warp_physics
-from safe_rl.envs.simulated import SimulatedEnv, require_episodes
+from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
 
 _LIDAR = ("lidar_type", "lidar_max_dist", "lidar_exp_gain", "lidar_alias")
 
@@ -116,9 +116,8 @@ class SafetyGymEnv(SimulatedEnv):
         self._observer = make_observer(scene, physics.device)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
-        self._renderer = WorldRenderer(self._world)
         self._costs = active_costs(self.config)
-        self.cost_keys = cost_keys(self._costs)
+        self.cost_keys = ["cost", *(row.key for row in self._costs), EXCEPTION_KEY]
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._announce(scene.model, observed, highest, seed)
@@ -148,19 +147,19 @@ class SafetyGymEnv(SimulatedEnv):
         super()._set_seed(seed)
         if seed is not None:
             # The layout of all rows if `randomize_layout` is False.
-            self._fixed_layout = self._layout_of(seed)
-
-    def _layout_of(self, seed: int) -> Tensor:
-        """Return the random key of the only layout of a seed, for `randomize_layout` False."""
-        return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
+            device = self._physics.device
+            self._fixed_layout = rng.fold(torch.tensor(seed, device=device), Purpose.LAYOUT)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world and its layout separately, [N]; None keeps the seed of a world."""
         super().set_row_seeds(seeds)
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
+        device = self._physics.device
         for row, seed in enumerate(seeds):
             if seed is not None:
-                self._fixed_layout[row] = self._layout_of(seed)
+                self._fixed_layout[row] = rng.fold(
+                    torch.tensor(seed, device=device), Purpose.LAYOUT
+                )
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
         """Return random keys of the layouts of the `ahead`-th next episodes, [N]."""
@@ -207,7 +206,7 @@ class SafetyGymEnv(SimulatedEnv):
         terminated = failed if config.continue_goal else failed | met
         truncated = (time_out if stuck is None else time_out | stuck) & ~terminated
         flags = torch.stack([met, terminated | truncated, terminated, truncated])
-        return self._step_output(torch.cat([reward.unsqueeze(0), costs]), flags)
+        return self._output(flags, torch.cat([reward.unsqueeze(0), costs]))
 
     def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; return the worlds whose physics failed, bool [N]."""
@@ -234,7 +233,8 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured.copy_(now)
         if self._task.met is None:
             return torch.zeros_like(failed), None
-        met = goals_met(self._task, self._world, now, failed)
+        met = self._task.met(self.config, self._world, now)
+        met = (self._world.require(f"'met' of task '{self.config.task}'", met) > 0) & ~failed
         if not (self.config.continue_goal and self._physics.maybe_any(met)):
             return met, None
         stuck = next_goals(self._world, self._plan, self._step_key(), met)
@@ -252,14 +252,26 @@ class SafetyGymEnv(SimulatedEnv):
         places = {"robot": self._world.robot_pos.unsqueeze(1), **self._world.objects}
         return TensorDict(places, self.batch_size).clone().to(self.device)
 
+    @cached_property
+    def _renderer(self) -> WorldRenderer:
+        return WorldRenderer(self._world)
+
     def _read_state(self) -> TensorDict:
-        state = read_state(self._world)
+        world = self._world
+        state = stored_tensors(world)
+        state["goal_pos"] = (
+            world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
+        )
+        state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets]
         if not self.config.randomize_layout:
-            state["fixed_layout"] = self._fixed_layout.expand(self.batch_size).clone()
-        return state
+            state["fixed_layout"] = self._fixed_layout.expand(self.batch_size)
+        return TensorDict(state, batch_size=self.batch_size).clone()
 
     def _write_state(self, state: TensorDictBase) -> None:
-        check_worlds(self._world, self.get_state(), state)
+        check_state(self.get_state(), state, OPTIONAL_KEYS)
+        button, number = state["goal_button"], self.config.buttons_num
+        if goal_is_button(self.config.task) and not ((button >= 0) & (button < number)).all():
+            raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
         self._fixed_layout = state.get("fixed_layout", self._fixed_layout).clone()
         if "layout" not in state and not self._episode.any():
             self.reset()

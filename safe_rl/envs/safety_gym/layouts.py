@@ -7,9 +7,7 @@ metres.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -37,8 +35,10 @@ class PlacementPlan:
         num_columns: 1 + M.
         rectangles: Areas of the centres, [P, R, 4] (xmin, ymin, xmax, ymax).
         thresholds: Cumulative probability of each object's rectangles, [P, R].
-        keepouts: Keepout of each, [P].
-        margin: Added to the sum of two keepouts.
+        clearance: Smallest allowed distance of every two objects, [P, P].
+        goal: Index of the goal in `names`, -1 if there is none.
+        goal_column: Column of the goal.
+        beside_goal: Columns of the other objects, and their clearance from the goal, [P - 1].
     """
 
     names: tuple[str, ...]
@@ -47,25 +47,10 @@ class PlacementPlan:
     num_columns: int
     rectangles: Tensor
     thresholds: Tensor
-    keepouts: Tensor
-    margin: float
-
-    @property
-    def goal_column(self) -> int:
-        """The goal's column in a layout."""
-        return self.columns[self.names.index("goal")]
-
-    @cached_property
-    def beside_goal(self) -> tuple[int, Tensor, Tensor]:
-        """Goal's index in `names`, columns of the other objects, and clearances, both [P - 1]."""
-        item = self.names.index("goal")
-        others = [i for i in range(len(self.names)) if i != item]
-        columns = torch.tensor([self.columns[i] for i in others], device=self.keepouts.device)
-        return item, columns, self.clearance(item, others)
-
-    def clearance(self, item: int, others: slice | list[int]) -> Tensor:
-        """Return the smallest allowed distances of an object from K others, [K]."""
-        return (self.keepouts[others] + self.keepouts[item] + self.margin).clamp(min=0.0)
+    clearance: Tensor
+    goal: int
+    goal_column: int
+    beside_goal: tuple[Tensor, Tensor]
 
 
 def plan_placements(scene: Scene, device: torch.device) -> PlacementPlan:
@@ -84,18 +69,33 @@ def plan_placements(scene: Scene, device: torch.device) -> PlacementPlan:
             labels, first = BY_KIND[kind].names(config), 1 + scene.slots[kind].start
         for index, label in enumerate(labels):
             rows.append((label, kind, first + index, _rectangles(config, kind, label, index)))
-    names, kinds, columns, rectangles = zip(*rows, strict=True)
-    stacked, thresholds = _stack(rectangles)
-    keepouts = [getattr(config, f"{kind}_keepout") for kind in kinds]
+    names, kinds, columns, areas = zip(*rows, strict=True)
+    # padded to one tensor; of the padding, the probability is 0
+    most = max(map(len, areas))
+    padded = [group + [group[-1]] * (most - len(group)) for group in areas]
+    rectangles = torch.tensor(padded, dtype=torch.float64)
+    sizes = (rectangles[..., 2:] - rectangles[..., :2]).clamp(min=0.0).prod(-1)
+    for row, group in enumerate(areas):
+        sizes[row, len(group) :] = 0.0
+        if sizes[row].sum() == 0.0:
+            sizes[row, : len(group)] = 1.0
+    keepout = torch.tensor(
+        [getattr(config, f"{kind}_keepout") for kind in kinds], dtype=torch.float64, device=device
+    )
+    clearance = (keepout + keepout[:, None] + config.placements_margin).clamp(min=0.0)
+    goal = names.index("goal") if "goal" in names else -1
+    others = [item for item in range(len(names)) if item != goal]
     return PlacementPlan(
         names=names,
         kinds=kinds,
         columns=columns,
         num_columns=1 + len(scene.names),
-        rectangles=stacked.to(device),
-        thresholds=thresholds.to(device),
-        keepouts=torch.tensor(keepouts, dtype=torch.float64, device=device),
-        margin=config.placements_margin,
+        rectangles=rectangles.to(device),
+        thresholds=(sizes.cumsum(-1) / sizes.sum(-1, keepdim=True)).to(device),
+        clearance=clearance,
+        goal=goal,
+        goal_column=columns[goal],
+        beside_goal=(torch.tensor(columns, device=device)[others], clearance[goal, others]),
     )
 
 
@@ -121,20 +121,6 @@ def _rectangles(config: SafetyGymConfig, kind: str, label: str, index: int) -> l
             f"or reduce '{kind}_keepout'."
         )
     return shrunk
-
-
-def _stack(rectangles: Sequence[list[_Rectangle]]) -> tuple[Tensor, Tensor]:
-    """Pad to one tensor [P, R, 4]; also return cumulative probabilities by area, [P, R]."""
-    most = max(len(group) for group in rectangles)
-    padded = torch.tensor(
-        [group + [group[-1]] * (most - len(group)) for group in rectangles], dtype=torch.float64
-    )
-    area = (padded[..., 2:] - padded[..., :2]).clamp(min=0.0).prod(-1)
-    for row, group in enumerate(rectangles):
-        area[row, len(group) :] = 0.0
-        if area[row].sum() == 0.0:
-            area[row, : len(group)] = 1.0
-    return padded, area.cumsum(-1) / area.sum(-1, keepdim=True)
 
 
 TRIES_PER_OBJECT = 100
@@ -177,7 +163,7 @@ def _fits(candidates: Tensor, others: Tensor, clearance: Tensor) -> Tensor:
 
 def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple[Tensor, Tensor]:
     """Place one object beside the K placed ones: keys [B], [B, K, 2] -> [B, 2], success [B]."""
-    clearance = plan.clearance(item, slice(item))
+    clearance = plan.clearance[item, :item]
     position = placed.new_zeros(len(key), 2)
     pending = torch.arange(len(key), device=key.device)
     for start in range(0, TRIES_PER_OBJECT, _BLOCK):
@@ -196,7 +182,7 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
 
 def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
     """Try one layout per key [B]: positions [B, P, 2], and the object without a place or -1 [B]."""
-    positions = plan.keepouts.new_zeros(len(key), len(plan.names), 2)
+    positions = plan.clearance.new_zeros(len(key), len(plan.names), 2)
     misfit = torch.full_like(key, -1)
     alive = torch.arange(len(key), device=key.device)
     for item in range(len(plan.names)):
@@ -209,16 +195,6 @@ def _try_layouts(plan: PlacementPlan, key: Tensor) -> tuple[Tensor, Tensor]:
     return positions, misfit
 
 
-def _rounds(total: int, rows: int) -> Iterator[tuple[int, int]]:
-    """Yield growing ranges of attempts: so a few difficult rows need few rounds."""
-    start, most = 0, max(1, _MAX_ROWS // max(1, rows))
-    size = 1
-    while start < total:
-        stop = min(start + size, total)
-        yield start, stop
-        start, size = stop, min(4 * size, most)
-
-
 def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
     """Draw a layout for every key [B]: positions [B, 1 + M, 2], zero for objects not placed.
 
@@ -229,11 +205,15 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
         LayoutError: If there is no layout; the message names the object that most often did not
             fit, and the keys that matter.
     """
-    layouts = plan.keepouts.new_zeros(len(key), plan.num_columns, 2)
+    layouts = plan.clearance.new_zeros(len(key), plan.num_columns, 2)
     misfits = key.new_zeros(len(plan.names))
     columns = torch.tensor(plan.columns, device=key.device)
     pending = torch.arange(len(key), device=key.device)
-    for start, stop in _rounds(TRIES_PER_LAYOUT, len(key)):
+    # growing ranges of attempts, so a few difficult rows need few rounds
+    stop, size, most = 0, 1, max(1, _MAX_ROWS // max(1, len(key)))
+    while stop < TRIES_PER_LAYOUT:
+        start, stop = stop, min(stop + size, TRIES_PER_LAYOUT)
+        size = min(4 * size, most)
         attempts = rng.fold(key[pending, None], torch.arange(start, stop, device=key.device))
         positions, misfit = _try_layouts(plan, attempts.flatten())
         misfits += torch.bincount(misfit[misfit >= 0], minlength=len(misfits))
@@ -288,7 +268,7 @@ def resample_goal(
         The positions [B, 2], and whether one was wanted and found, bool [B]: within 10,000 draws,
         or within 200 if the host does not read results.
     """
-    item, columns, clearance = plan.beside_goal
+    item, (columns, clearance) = plan.goal, plan.beside_goal
     position = layouts.new_zeros(len(key), 2)
     missing = torch.ones_like(key, dtype=torch.bool) if wanted is None else wanted
     placed, wanted = layouts.index_select(1, columns), missing

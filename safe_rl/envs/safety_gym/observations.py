@@ -19,26 +19,14 @@ from safe_rl.envs.contract import add_columns
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.lidar import lidar_blocks
-from safe_rl.envs.safety_gym.readings import READINGS, Reading, sensor_blocks
-from safe_rl.envs.safety_gym.renderer import vision_blocks
+from safe_rl.envs.safety_gym.readings import Reading, active_readings, sensor_blocks
+from safe_rl.envs.safety_gym.renderer import vision_block
 from safe_rl.envs.safety_gym.world import Block, Bounds, Scene, Shapes, World
-
-
-def _plain(scene: Scene, device: torch.device) -> list[Block]:
-    return [
-        Block({row.name: (size,)}, partial(_read, row, size), row.bounds)
-        for row in READINGS
-        if row.present(scene.config)
-        for size in [row.size(scene.config, scene)]
-    ]
 
 
 def _read(row: Reading, size: int, world: World) -> Tensor:
     """Return the values of a reading [N, size]; ConfigError if their shape is wrong."""
     return world.require(f"The observation '{row.name}'", row.read(world), size)
-
-
-SOURCES = (sensor_blocks, lidar_blocks, _plain, vision_blocks)
 
 
 class Observer(NamedTuple):
@@ -66,7 +54,13 @@ class Observer(NamedTuple):
 
 def make_observer(scene: Scene, device: torch.device) -> Observer:
     """Build the observer of a scene; ConfigError if a component cannot be observed."""
-    blocks = [block for source in SOURCES for block in source(scene, device)]
+    config = scene.config
+    blocks = [*sensor_blocks(scene, device), *lidar_blocks(scene, device)]
+    for row in active_readings(config):
+        size = row.size(config, scene)
+        blocks.append(Block({row.name: (size,)}, partial(_read, row, size), row.bounds))
+    if config.observe_vision:
+        blocks.append(vision_block(scene))
     names = [name for block in blocks for name in block.shapes]
     if not names:
         raise ConfigError("Nothing is observed: set at least one 'observe_*' key.")

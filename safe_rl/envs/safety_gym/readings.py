@@ -24,19 +24,21 @@ class Reading(NamedTuple):
 
     Attributes:
         name: Name of the component.
-        present: Whether a configuration has it.
+        flags: Configuration keys that must all be true, or not 0, for the component to exist.
         size: Number of values.
         read: World -> [N, size].
         touches: Kinds of objects whose contacts with the robot it reads.
         bounds: Lowest and highest value.
+        kind: Kind of object that the task must have; "" for none.
     """
 
     name: str
-    present: Callable[[SafetyGymConfig], bool]
+    flags: tuple[str, ...]
     size: Callable[[SafetyGymConfig, Scene], int]
     read: Callable[[World], Tensor]
     touches: tuple[str, ...] = ()
     bounds: Bounds = UNBOUNDED
+    kind: str = ""
 
 
 def _compass(world: World, kind: str) -> Tensor:
@@ -70,28 +72,31 @@ def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
     return torch.cat([local, vector[:, 3:]], -1)
 
 
-def _has(config: SafetyGymConfig, element: str) -> bool:
-    task = TASKS[config.task]
-    return element in (*task.elements, *task.at_origin)
-
-
 READINGS: list[Reading] = [
-    Reading("goal_compass", lambda c: c.observe_goal_comp and _has(c, "goal"),
-            lambda c, s: c.compass_shape, lambda w: _compass(w, "goal"), bounds=(-1.0, 1.0)),
-    Reading("box_compass", lambda c: c.observe_box_comp and _has(c, "box"),
-            lambda c, s: c.compass_shape, lambda w: _compass(w, "box"), bounds=(-1.0, 1.0)),
-    Reading("goal_dist", lambda c: c.observe_goal_dist and _has(c, "goal"),
-            lambda c, s: 1, lambda w: torch.exp(-goal_distance(w)), bounds=(0.0, 1.0)),
-    Reading("remaining", lambda c: c.observe_remaining, lambda c, s: 1,
+    Reading("goal_compass", ("observe_goal_comp",), lambda c, s: c.compass_shape,
+            lambda w: _compass(w, "goal"), bounds=(-1.0, 1.0), kind="goal"),
+    Reading("box_compass", ("observe_box_comp",), lambda c, s: c.compass_shape,
+            lambda w: _compass(w, "box"), bounds=(-1.0, 1.0), kind="box"),
+    Reading("goal_dist", ("observe_goal_dist",), lambda c, s: 1,
+            lambda w: torch.exp(-goal_distance(w)), bounds=(0.0, 1.0), kind="goal"),
+    Reading("remaining", ("observe_remaining",), lambda c, s: 1,
             lambda w: (w.step_count / w.scene.config.num_steps).unsqueeze(-1)),
-    Reading("com", lambda c: c.observe_com, lambda c, s: 3, lambda w: w.com),
-    Reading("ctrl", lambda c: c.observe_ctrl, lambda c, s: s.model.nu, lambda w: w.ctrl),
-    Reading("freejoint", lambda c: c.observe_freejoint, _freejoint_size, lambda w: w.qpos[:, :7]),
-    Reading("qpos", lambda c: c.observe_qpos, lambda c, s: s.model.nq,
+    Reading("com", ("observe_com",), lambda c, s: 3, lambda w: w.com),
+    Reading("ctrl", ("observe_ctrl",), lambda c, s: s.model.nu, lambda w: w.ctrl),
+    Reading("freejoint", ("observe_freejoint",), _freejoint_size, lambda w: w.qpos[:, :7]),
+    Reading("qpos", ("observe_qpos",), lambda c, s: s.model.nq,
             lambda w: _from_start(w, w.qpos, moved=True)),
-    Reading("qvel", lambda c: c.observe_qvel, lambda c, s: s.model.nv,
+    Reading("qvel", ("observe_qvel",), lambda c, s: s.model.nv,
             lambda w: _from_start(w, w.qvel, moved=False)),
 ]  # fmt: skip
+
+
+def active_readings(config: SafetyGymConfig) -> list[Reading]:
+    """Return the rows of the present table that a configuration has."""
+    task = TASKS[config.task]
+    kinds = ("", *task.elements, *task.at_origin)
+    flagged = (row for row in READINGS if all(getattr(config, flag) for flag in row.flags))
+    return [row for row in flagged if row.kind in kinds]
 
 
 def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint) -> list[int]:
@@ -102,19 +107,6 @@ def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint)
         for i in range(scene.robot_sensors)
         if model.sensor_type[i] == kind and model.jnt_type[model.sensor_objid[i]] == joint
     ]
-
-
-def _named_sensors(scene: Scene) -> list[int]:
-    config = scene.config
-    known = {scene.model.sensor(i).name: i for i in range(scene.robot_sensors)}
-    for name in config.sensors_obs:
-        if name not in known:
-            raise ConfigError(
-                f"'sensors_obs': robot '{config.robot_base}' has no sensor '{name}'."
-                f"{did_you_mean(name, known)} It has {', '.join(known) or 'none'}: add the sensor "
-                "to the robot's file, or list only those it has."
-            )
-    return [known[name] for name in config.sensors_obs]
 
 
 def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
@@ -130,7 +122,15 @@ def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
                 "on a slide joint, but observations must not depend on the world's origin: remove "
                 "the sensor, or set 'observe_sensors' to False."
             )
-    raw, angles, quaternions = _named_sensors(scene), [], []
+    known = {scene.model.sensor(i).name: i for i in range(scene.robot_sensors)}
+    for name in config.sensors_obs:
+        if name not in known:
+            raise ConfigError(
+                f"'sensors_obs': robot '{config.robot_base}' has no sensor '{name}'."
+                f"{did_you_mean(name, known)} It has {', '.join(known) or 'none'}: add the sensor "
+                "to the robot's file, or list only those it has."
+            )
+    raw, angles, quaternions = [known[name] for name in config.sensors_obs], [], []
     if config.sensors_hinge_joints:
         raw += _joint_sensors(scene, sensor.mjSENS_JOINTVEL, joint.mjJNT_HINGE)
         angles += _joint_sensors(scene, sensor.mjSENS_JOINTPOS, joint.mjJNT_HINGE)
@@ -142,7 +142,7 @@ def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
     if not config.sensors_angle_components:
         raw, angles, quaternions = raw + angles + quaternions, [], []
     groups = (
-        (raw, None, lambda values: values),
+        (raw, None, torch.clone),
         (angles, (2,), lambda angle: torch.stack([torch.sin(angle), torch.cos(angle)], -1)),
         (quaternions, (3, 3), lambda q: rotation_matrix(q.unflatten(1, (-1, 4)))),
     )

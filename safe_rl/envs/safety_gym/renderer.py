@@ -99,15 +99,13 @@ def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
     return values[row].cpu().numpy()
 
 
-def vision_blocks(scene: Scene, device: torch.device) -> list[Block]:
+def vision_block(scene: Scene) -> Block:
     """Return the component `vision`: RGB in [0, 1], rows from top to bottom, [height, width, 3].
 
     Raises:
         ConfigError: If the robot has no camera of the name "vision".
     """
     config = scene.config
-    if not config.observe_vision:
-        return []
     cameras = [scene.model.camera(i).name for i in range(scene.model.ncam)]
     if VISION not in cameras:
         others = f" Its cameras are {cameras}: rename one of them." if cameras else ""
@@ -125,7 +123,7 @@ def vision_blocks(scene: Scene, device: torch.device) -> list[Block]:
             picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))
         return pixels.flatten(1).to(world.robot_pos) / 255
 
-    return [Block({"vision": (height, width, 3)}, read, (0.0, 1.0))]
+    return Block({"vision": (height, width, 3)}, read, (0.0, 1.0))
 
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25

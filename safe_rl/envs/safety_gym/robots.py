@@ -19,6 +19,7 @@ from typing import Any
 import mujoco
 
 from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.safety_gym.config import BUNDLED, PATHS_OF_2019, robot_path
 from safe_rl.naming import did_you_mean
 
 
@@ -40,11 +41,6 @@ def robot_files(path: Path) -> list[Path]:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
     return [file for file in map(Path, named) if file.is_file()]
 
-
-BUNDLED = Path(__file__).parent / "robots"
-ROBOTS: dict[str, Path] = {path.stem: path for path in sorted(BUNDLED.glob("*.xml"))}
-# Paths in the dictionaries of 2019, relative to the folder of that package -> name.
-PATHS_OF_2019 = {f"xmls/{name}.xml": name for name in ROBOTS}
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators without a range in the file
 _SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
@@ -73,11 +69,6 @@ def _refused(path: Path, what: str) -> ConfigError:
     return ConfigError(f"'robot_base': {path} {what}")
 
 
-def robot_path(base: str) -> Path:
-    """Return the file of a robot, given by its name in `ROBOTS` or its path."""
-    return ROBOTS.get(base, Path(base))
-
-
 def load_robot(base: str) -> Robot:
     """Load a robot, by name or file, and check that it can be placed, moved and stepped.
 
@@ -93,20 +84,15 @@ def load_robot(base: str) -> Robot:
         model = compiled.compile()
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
-    _check_ranges(model, path)
-    _check_body(model, path)
-    if _changes_all_masses(spec.compiler):
+    _check_robot(model, path)
+    options = spec.compiler  # these would change the masses of the objects around it, too
+    bounded = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
+    if bounded or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1]:
         spec = _with_masses_of(compiled, model)
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
             actuator.ctrlrange, actuator.ctrllimited = CONTROL_RANGE, True
     return Robot(spec, model.nbody - 1, model.nsensor, _is_planar(model, path))
-
-
-def _changes_all_masses(options: mujoco.MjsCompiler) -> bool:
-    """Whether options of a robot's file would change the masses of the objects around it, too."""
-    bounded = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
-    return bounded or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1]
 
 
 def _with_masses_of(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec:
@@ -122,7 +108,7 @@ def _with_masses_of(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec
     return spec
 
 
-def _check_ranges(model: mujoco.MjModel, path: Path) -> None:
+def _check_robot(model: mujoco.MjModel, path: Path) -> None:
     for (low, high), limited in zip(
         model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
     ):
@@ -133,9 +119,6 @@ def _check_ranges(model: mujoco.MjModel, path: Path) -> None:
                 f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
                 "lower bound first.",
             )
-
-
-def _check_body(model: mujoco.MjModel, path: Path) -> None:
     names = [model.body(i).name for i in range(1, model.nbody)]
     if "robot" not in names:
         hint = did_you_mean("robot", names) or f" Its bodies are {names}."

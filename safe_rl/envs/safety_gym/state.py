@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
-from safe_rl.envs.simulated import check_state
 
 
 def make_world(scene: Scene, physics: Physics) -> World:
@@ -26,6 +26,13 @@ def make_world(scene: Scene, physics: Physics) -> World:
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
     robot_pos = physics.xpos[:, robot]
     velocity = int(model.sensor("robot_vel").adr[0])
+    yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
+    if scene.config.robot_rot is not None:
+        yaws[0] = scene.config.robot_rot
+    for kind, span in scene.slots.items():
+        if span.stop <= scene.num_free:
+            given = getattr(scene.config, f"{kind}_rots", ())[: span.stop - span.start]
+            yaws[1 + span.start : 1 + span.start + len(given)] = yaws.new_tensor(given)
     return World(
         scene=scene,
         physics=physics,
@@ -47,6 +54,7 @@ def make_world(scene: Scene, physics: Physics) -> World:
         target_travel=torch.tensor(scene.travel, **real),
         # The targets of guided objects are at twice the height of the objects' centres.
         target_height=2 * positions[0, scene.guided, 2],
+        pinned_yaws=yaws.to(physics.device),
         layout=torch.zeros(num_envs, 1 + num_objects, 2, **real),
         start_pose=torch.zeros(num_envs, 3, **real),
         goal_button=torch.full((num_envs,), NO_BUTTON, **whole),
@@ -71,24 +79,6 @@ def yaw_quaternion(yaw: Tensor) -> Tensor:
     """Convert rotations about z by yaw [...] to quaternions (w, x, y, z) [..., 4]."""
     zero = torch.zeros_like(yaw)
     return torch.stack([torch.cos(yaw / 2), zero, zero, torch.sin(yaw / 2)], -1)
-
-
-def pose_bodies(world: World, mask: Tensor, yaws: Tensor) -> None:
-    """Set the poses of robot and free bodies in the worlds of a mask, with yaws [N, 1 + F]."""
-    scene, physics = world.scene, world.physics
-    pose = torch.cat([world.layout[:, 0], yaws[:, :1]], -1)
-    put(world.start_pose, mask, pose)
-    put(physics.qpos[:, :2], mask, pose[:, :2])
-    if scene.planar:
-        put(physics.qpos[:, 2], mask, yaws[:, 0])
-    else:
-        put(physics.qpos[:, 3:7], mask, yaw_quaternion(yaws[:, 0]))
-    free = physics.qpos[:, scene.robot_nq :].unflatten(1, (scene.num_free, 7))
-    put(free[..., :2], mask, world.layout[:, 1 : 1 + scene.num_free])
-    put(free[..., 3:], mask, yaw_quaternion(yaws[:, 1:]))
-    if scene.num_targets:
-        quaternion = yaw_quaternion(yaws[:, 1 + scene.guided.start : 1 + scene.guided.stop])
-        put(physics.mocap_quat[:, : scene.num_targets], mask, quaternion)
 
 
 def gremlin_path(world: World, time: Tensor, num_substeps: int) -> Tensor:
@@ -141,7 +131,7 @@ SEED_KEYS = ("fixed_layout", "seed", "episode")  # of the environment, not of it
 OPTIONAL_KEYS = (*LAYOUT_KEYS, *SEED_KEYS, "target_quat", "ctrl", "act", "history")
 
 
-def _stored(world: World) -> dict[str, Tensor]:
+def stored_tensors(world: World) -> dict[str, Tensor]:
     """Return the tensors that a state contains unchanged, by key."""
     return {
         **{key: getattr(world.physics, key) for key in (*PHYSICS_KEYS, "ctrl")},
@@ -150,22 +140,13 @@ def _stored(world: World) -> dict[str, Tensor]:
     }
 
 
-def read_state(world: World) -> TensorDict:
-    """Return copies of the state of N worlds, a TensorDict [N]."""
-    state = _stored(world)
-    has_goal = "goal" in world.scene.slots
-    state["goal_pos"] = world.at("goal")[:, 0] if has_goal else torch.zeros_like(world.com)
-    state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets]
-    return TensorDict(state, batch_size=[len(world.step_count)]).clone()
-
-
 def write_state(world: World, state: TensorDictBase) -> None:
-    """Set N worlds to a state that `check_worlds` accepted, and compute all outputs."""
+    """Set N worlds to a state that fits them, and compute all outputs."""
     scene, physics = world.scene, world.physics
     target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
     everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
     physics.reset(everywhere)
-    for key, tensor in _stored(world).items():
+    for key, tensor in stored_tensors(world).items():
         if key in state:
             tensor.copy_(state[key])
     physics.mocap_quat[:, : scene.num_targets] = target_quat
@@ -179,16 +160,3 @@ def write_state(world: World, state: TensorDictBase) -> None:
     place_mocaps(world)
     physics.forward()
     refresh(world)
-
-
-def check_worlds(world: World, expected: TensorDictBase, state: TensorDictBase) -> None:
-    """Check a state before it is set, by comparison with the present one, `expected`.
-
-    Raises:
-        KeyError: If a key is missing.
-        ValueError: If a shape or type does not fit, or a goal button does not exist.
-    """
-    check_state(expected, state, OPTIONAL_KEYS)
-    button, number = state["goal_button"], world.scene.config.buttons_num
-    if goal_is_button(world.scene.config.task) and not ((button >= 0) & (button < number)).all():
-        raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")

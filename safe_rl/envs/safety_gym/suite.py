@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.config import SafetyGymConfig
+from safe_rl.envs.safety_gym.config import PATHS_OF_2019, ROBOTS, SafetyGymConfig
 from safe_rl.envs.safety_gym.config_keys import LARGEST_SEED
-from safe_rl.envs.safety_gym.robots import PATHS_OF_2019, ROBOTS
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
 from safe_rl.naming import did_you_mean
 
@@ -40,27 +39,22 @@ _COMMON: Values = {
 }
 
 
-def _extents(half: float) -> Values:
-    return {"placements_extents": (-half, -half, half, half)}
-
-
-def _level(half: float, constrained: str, observed: str, **numbers: int) -> Values:
-    """Return the extent of placements, constraints, lidars and numbers of objects of a level."""
-    flags = [f"constrain_{kind}" for kind in constrained.split()]
-    flags += [f"observe_{kind}" for kind in observed.split()]
-    return {**_extents(half), **numbers, **dict.fromkeys(flags, True)}
-
-
-_BUTTON_COSTS = "hazards buttons gremlins"
+_SMALL, _MIDDLE = (-1.0, -1.0, 1.0, 1.0), (-1.5, -1.5, 1.5, 1.5)  # the default is level 2's
+_BUTTONS: Values = {
+    **{"constrain_hazards": True, "constrain_buttons": True, "constrain_gremlins": True},
+    **{"observe_hazards": True, "observe_gremlins": True},
+}
 # For each task: the values of all levels, then those of each level.
 _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
     "Goal": (
         {"task": "goal", "goal_size": 0.3, "goal_keepout": 0.305, "hazards_size": 0.2,
          "hazards_keepout": 0.18},
         (
-            _extents(1.0),
-            _level(1.5, "hazards", "hazards vases", hazards_num=8, vases_num=1),
-            _level(2.0, "hazards vases", "hazards vases", hazards_num=10, vases_num=10),
+            {"placements_extents": _SMALL},
+            {"placements_extents": _MIDDLE, "hazards_num": 8, "vases_num": 1,
+             "constrain_hazards": True, "observe_hazards": True, "observe_vases": True},
+            {"hazards_num": 10, "vases_num": 10, "constrain_hazards": True, "constrain_vases": True,
+             "observe_hazards": True, "observe_vases": True},
         ),
     ),
     "Button": (
@@ -68,24 +62,27 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
          "observe_buttons": True, "hazards_size": 0.2, "hazards_keepout": 0.18,
          "gremlins_travel": 0.35, "gremlins_keepout": 0.4},
         (
-            _extents(1.0),
-            _level(1.5, _BUTTON_COSTS, "hazards gremlins", hazards_num=4, gremlins_num=4),
-            _level(1.8, _BUTTON_COSTS, "hazards gremlins", hazards_num=8, gremlins_num=6),
+            {"placements_extents": _SMALL},
+            {"placements_extents": _MIDDLE, "hazards_num": 4, "gremlins_num": 4, **_BUTTONS},
+            {"placements_extents": (-1.8, -1.8, 1.8, 1.8), "hazards_num": 8, "gremlins_num": 6,
+             **_BUTTONS},
         ),
     ),
     "Push": (
         {"task": "push", "box_size": 0.2, "box_null_dist": 0.0, "hazards_size": 0.3},
         (
-            _extents(1.0),
-            _level(1.5, "hazards", "hazards pillars", hazards_num=2, pillars_num=1),
-            _level(2.0, "hazards pillars", "hazards pillars", hazards_num=4, pillars_num=4),
+            {"placements_extents": _SMALL},
+            {"placements_extents": _MIDDLE, "hazards_num": 2, "pillars_num": 1,
+             "constrain_hazards": True, "observe_hazards": True, "observe_pillars": True},
+            {"hazards_num": 4, "pillars_num": 4, "constrain_hazards": True,
+             "constrain_pillars": True, "observe_hazards": True, "observe_pillars": True},
         ),
     ),
 }  # fmt: skip
 
-# A robot's own values (the Car's smaller box) override those of the task.
-SUITE: dict[str, SafetyGymConfig] = {
-    f"{robot}{task}{level}": SafetyGymConfig(**{**_COMMON, **shared, **levels[level], **own})
+# Keys that differ from their defaults. A robot's own (the Car's smaller box) override the task's.
+SUITE: dict[str, Values] = {
+    f"{robot}{task}{level}": {**_COMMON, **shared, **levels[level], **own}
     for robot, own in _ROBOTS.items()
     for task, (shared, levels) in _TASKS.items()
     for level in range(3)
@@ -113,18 +110,20 @@ _BOUNDED: dict[str, Values] = {
     "Circle1": {**_DEBUG["Circle"], **_CIRCLE},
     "Circle2": {**_DEBUG["Circle"], **_CIRCLE, "boundary_y": 1.125},
 }
-_NO_TARGETS: Values = {"observe_goal_lidar": False, "observe_box_lidar": False, **_extents(1.0)}
+_NO_TARGETS: Values = {
+    **{"observe_goal_lidar": False, "observe_box_lidar": False, "placements_extents": _SMALL}
+}
 
 _DEBUG_SUITE = {
-    f"{robot}{task}": SafetyGymConfig(**{**_COMMON, **_NO_TARGETS, **values, **own})
+    f"{robot}{task}": {**_COMMON, **_NO_TARGETS, **values, **own}
     for robot, own in _ROBOTS.items()
     for task, values in (_DEBUG | _BOUNDED).items()
 }
 
 # Named environments that are not part of the benchmark.
-EXTRAS: dict[str, SafetyGymConfig] = _DEBUG_SUITE | {
-    f"{name}Vision": config.replace(observe_vision=True, observation_flatten=False)
-    for name, config in (SUITE | _DEBUG_SUITE).items()
+EXTRAS: dict[str, Values] = _DEBUG_SUITE | {
+    f"{name}Vision": {**keys, "observe_vision": True, "observation_flatten": False}
+    for name, keys in (SUITE | _DEBUG_SUITE).items()
 }
 
 
@@ -148,8 +147,8 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         return check(SafetyGymConfig.from_dict(env))
     if not isinstance(env, str):
         raise ConfigError(
-            "An environment of Safety Gym is given by its name, a mapping of keys, or a "
-            f"SafetyGymConfig; got a {type(env).__name__}."
+            "An environment is given by its name, a mapping of keys, or a SafetyGymConfig; got a "
+            f"{type(env).__name__}."
         )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
     named = SUITE | EXTRAS
@@ -160,7 +159,7 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
             "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and {name}Vision "
             "for each of them. safe_rl.envs.make_env makes all others, also yours."
         )
-    return named[name]
+    return SafetyGymConfig(**named[name])
 
 
 def check(config: SafetyGymConfig) -> SafetyGymConfig:
@@ -175,7 +174,14 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
     name = PATHS_OF_2019.get(config.robot_base)
     if name is not None and not Path(config.robot_base).is_file():
         config = config.replace(robot_base=name)
-    _check_robot(config.robot_base)
+    robot = config.robot_base
+    if robot.endswith(".xml") and not Path(robot).is_file():
+        raise ConfigError(f"'robot_base': there is no file {robot!r}.")
+    if not robot.endswith(".xml") and robot not in ROBOTS:
+        raise ConfigError(
+            f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
+            f"got {robot!r}.{did_you_mean(robot, ROBOTS)}"
+        )
     if config.layout_seeds_first + (config.layout_seeds or 0) > LARGEST_SEED:
         raise ConfigError(
             f"'layout_seeds_first' and 'layout_seeds' together must be at most {LARGEST_SEED}, got "
@@ -200,14 +206,3 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
                 stacklevel=2,
             )
     return config
-
-
-def _check_robot(robot: str) -> None:
-    if robot.endswith(".xml"):
-        if not Path(robot).is_file():
-            raise ConfigError(f"'robot_base': there is no file {robot!r}.")
-    elif robot not in ROBOTS:
-        raise ConfigError(
-            f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
-            f"got {robot!r}.{did_you_mean(robot, ROBOTS)}"
-        )

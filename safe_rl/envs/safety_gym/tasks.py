@@ -157,11 +157,3 @@ def dense_reward(task: Task, world: World, before: Tensor, now: Tensor, failed: 
     if config.reward_clip:
         reward = reward.clamp(-config.reward_clip, config.reward_clip)
     return reward
-
-
-def goals_met(task: Task, world: World, now: Tensor, failed: Tensor) -> Tensor:
-    """Return which worlds meet their goals, bool [N], for tasks with goals; failed ones do not."""
-    assert task.met is not None
-    config = world.scene.config
-    met = world.require(f"'met' of task '{config.task}'", task.met(config, world, now))
-    return (met > 0) & ~failed

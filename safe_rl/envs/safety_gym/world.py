@@ -90,6 +90,7 @@ class World:
         contacts: Number of contact points of the robot with each object of a kind, [N, K].
         qpos, qvel, ctrl, sensordata: The arrays of MuJoCo, [N, ·].
         target_travel, target_height: Radius and height of the targets of guided objects [G] (m).
+        pinned_yaws: Fixed yaws of robot and free bodies, NaN where they are drawn [1 + F].
         layout: Positions at the start of the episode, and of the newest goal [N, 1 + M, 2].
         start_pose: (x, y, yaw) of the robot at the start of the episode [N, 3].
         goal_button: Index of the goal button, -1 if there is none, int64 [N].
@@ -115,6 +116,7 @@ class World:
     sensordata: Tensor
     target_travel: Tensor
     target_height: Tensor
+    pinned_yaws: Tensor
     layout: Tensor
     start_pose: Tensor
     goal_button: Tensor

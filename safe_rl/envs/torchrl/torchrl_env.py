@@ -30,7 +30,7 @@ from torchrl.envs.transforms import Transform
 from safe_rl.envs.contract import ConstrainedEnv, bounds_of
 from safe_rl.envs.costs import is_cost
 from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.families import TORCHRL, TORCHRL_CLASSES, complete_foreign
+from safe_rl.envs.families import FOREIGN, TORCHRL_CLASSES, complete_foreign
 from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
@@ -80,13 +80,13 @@ def make_torchrl(
 ) -> TorchRLEnv:
     """Make environments of a class of TorchRL or of the user.
 
-    The arguments are those of `make_gymnasium`, with the keys of conf/env/torchrl.yaml.
+    The arguments are those of `make_gymnasium`, with the keys of `env=torchrl`.
 
     Raises:
         ConfigError: For an unknown key or class, or an environment that algorithms cannot use.
         TargetError: For a class or function whose module was not named by `import=`.
     """
-    config = complete_foreign(TORCHRL, config)
+    config = complete_foreign(FOREIGN["torchrl"], config)
     env = _tried(config, partial(_batch, num_envs=num_envs))
     if not isinstance(env, EnvBase) or list(env.batch_size) != [num_envs]:
         shown = list(env.batch_size) if isinstance(env, EnvBase) else type(env).__name__

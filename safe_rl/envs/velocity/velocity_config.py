@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, get_type_hints
 
+from pydantic import AllowInfNan
+
+from safe_rl.checks import rule
 from safe_rl.envs.errors import ConfigError, on_cpu_only
-from safe_rl.envs.physics.dynamics import SCALES
+from safe_rl.envs.keys import Count, NotNegative, Number, Positive, checked
 from safe_rl.naming import did_you_mean
-from safe_rl.ranges import Count, NotNegative, Number, Positive, Values, values_of
 
 PARTS = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 """What may be observed besides positions and velocities, in this order."""
@@ -46,69 +47,49 @@ class Runner:
     defaults: Mapping[str, Any]
 
 
-def _keys(**own: Any) -> Mapping[str, Any]:
-    common: dict[str, Any] = {
-        "num_steps": 1000,
-        "forward_reward_weight": 1.0,
-        "exclude_current_positions_from_observation": True,
-        **dict.fromkeys(SCALES, 1.0),
-    }
-    return MappingProxyType(common | own)
-
-
-def _standing(z: tuple[float, float], reward: float = 1.0) -> dict[str, Any]:
-    """Keys of the robots that can fall."""
-    return {"healthy_reward": reward, "terminate_when_unhealthy": True, "healthy_z_range": z}
-
-
+_WALKER: Mapping[str, Any] = {"healthy_reward": 1.0, "terminate_when_unhealthy": True}
 RUNNERS: Mapping[str, Runner] = {
     "half_cheetah": Runner(
         gymnasium_id="HalfCheetah-v5", mjcf="half_cheetah.xml", place="x", num_hidden=1,
         normal_velocities=True,
-        defaults=_keys(velocity_threshold=3.2096, frame_skip=5, ctrl_cost_weight=0.1,
-                       reset_noise_scale=0.1)),
+        defaults={"velocity_threshold": 3.2096, "frame_skip": 5, "reset_noise_scale": 0.1,
+                  "forward_reward_weight": 1.0, "ctrl_cost_weight": 0.1}),
     "hopper": Runner(
-        gymnasium_id="Hopper-v5", mjcf="hopper.xml", place="x", num_hidden=1,
-        velocity_limit=10.0,
-        defaults=_keys(velocity_threshold=0.7402, frame_skip=4, ctrl_cost_weight=1e-3,
-                       reset_noise_scale=5e-3, **_standing((0.7, math.inf)),
-                       healthy_angle_range=(-0.2, 0.2), healthy_state_range=(-100.0, 100.0))),
+        gymnasium_id="Hopper-v5", mjcf="hopper.xml", place="x", num_hidden=1, velocity_limit=10.0,
+        defaults={"velocity_threshold": 0.7402, "frame_skip": 4, "reset_noise_scale": 5e-3,
+                  "forward_reward_weight": 1.0, "ctrl_cost_weight": 1e-3, **_WALKER,
+                  "healthy_z_range": (0.7, math.inf), "healthy_angle_range": (-0.2, 0.2),
+                  "healthy_state_range": (-100.0, 100.0)}),
     "walker2d": Runner(
         gymnasium_id="Walker2d-v5", mjcf="walker2d_v5.xml", place="x", num_hidden=1,
         velocity_limit=10.0,
-        defaults=_keys(velocity_threshold=2.3415, frame_skip=4, ctrl_cost_weight=1e-3,
-                       reset_noise_scale=5e-3, **_standing((0.8, 2.0)),
-                       healthy_angle_range=(-1.0, 1.0))),
+        defaults={"velocity_threshold": 2.3415, "frame_skip": 4, "reset_noise_scale": 5e-3,
+                  "forward_reward_weight": 1.0, "ctrl_cost_weight": 1e-3, **_WALKER,
+                  "healthy_z_range": (0.8, 2.0), "healthy_angle_range": (-1.0, 1.0)}),
     "ant": Runner(
-        gymnasium_id="Ant-v5", mjcf="ant.xml", place="torso", num_hidden=2,
-        normal_velocities=True,
-        defaults=_keys(velocity_threshold=2.6222, frame_skip=5, ctrl_cost_weight=0.5,
-                       reset_noise_scale=0.1, **_standing((0.2, 1.0)), contact_cost_weight=5e-4,
-                       contact_force_range=(-1.0, 1.0), include_cfrc_ext_in_observation=True)),
+        gymnasium_id="Ant-v5", mjcf="ant.xml", place="torso", num_hidden=2, normal_velocities=True,
+        defaults={"velocity_threshold": 2.6222, "frame_skip": 5, "reset_noise_scale": 0.1,
+                  "forward_reward_weight": 1.0, "ctrl_cost_weight": 0.5, **_WALKER,
+                  "healthy_z_range": (0.2, 1.0), "contact_cost_weight": 5e-4,
+                  "contact_force_range": (-1.0, 1.0), "include_cfrc_ext_in_observation": True}),
     "swimmer": Runner(
         gymnasium_id="Swimmer-v5", mjcf="swimmer.xml", place="x", num_hidden=2,
-        defaults=_keys(velocity_threshold=0.2282, frame_skip=4, ctrl_cost_weight=1e-4,
-                       reset_noise_scale=0.1)),
+        defaults={"velocity_threshold": 0.2282, "frame_skip": 4, "reset_noise_scale": 0.1,
+                  "forward_reward_weight": 1.0, "ctrl_cost_weight": 1e-4}),
     "humanoid": Runner(
         gymnasium_id="Humanoid-v5", mjcf="humanoid.xml", place="centre_of_mass", num_hidden=2,
-        defaults=_keys(velocity_threshold=1.4149, frame_skip=5, ctrl_cost_weight=0.1,
-                       reset_noise_scale=1e-2, **_standing((1.0, 2.0), reward=5.0),
-                       contact_cost_weight=5e-7, contact_cost_range=(-math.inf, 10.0),
-                       **{f"include_{part}_in_observation": True for part in PARTS},
-                       forward_reward_weight=1.25)),
+        defaults={"velocity_threshold": 1.4149, "frame_skip": 5, "reset_noise_scale": 1e-2,
+                  "forward_reward_weight": 1.25, "ctrl_cost_weight": 0.1, **_WALKER,
+                  "healthy_reward": 5.0, "healthy_z_range": (1.0, 2.0),
+                  "contact_cost_weight": 5e-7, "contact_cost_range": (-math.inf, 10.0),
+                  **{f"include_{part}_in_observation": True for part in PARTS}}),
 }  # fmt: skip
 
 
-def _is_interval(value: Any) -> bool:
-    """Whether a value is a pair of ordered numbers, which may be infinite."""
-    is_pair = isinstance(value, list | tuple) and len(value) == 2
-    are_numbers = is_pair and all(type(bound) in (int, float) for bound in value)
-    return are_numbers and value[0] <= value[1]
-
-
+_Bound = Annotated[float, AllowInfNan()]
 Interval = Annotated[
-    tuple[float, float],
-    Values(_is_interval, "a list of two numbers (lowest, highest) with lowest <= highest"),
+    tuple[_Bound, _Bound],
+    rule(lambda pair: pair[0] <= pair[1], "an interval (lowest, highest) with lowest <= highest"),
 ]
 
 
@@ -129,60 +110,66 @@ class VelocityConfig:
         (2, (-0.2, 0.2))
     """
 
-    robot: str
-    velocity_threshold: NotNegative  # m/s; faster costs 1
-    num_steps: Count  # of an episode
-    frame_skip: Count  # substeps per step
+    robot: Annotated[str, "the robot"] = ""
+    velocity_threshold: Annotated[NotNegative | None, "speed above which a step costs 1 [m/s]"] = (
+        None
+    )
+    num_steps: Annotated[Count, "steps after which an episode is truncated"] = 1000
+    frame_skip: Annotated[Count | None, "substeps per step"] = None
     # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
-    mass_scale: Positive
-    friction_scale: Positive
-    damping_scale: NotNegative  # of joints
-    strength_scale: NotNegative  # of actuators
-    reset_noise_scale: NotNegative  # of positions [m, rad] and velocities [m/s, rad/s]
-    exclude_current_positions_from_observation: bool
-    include_cinert_in_observation: bool | None = None
-    include_cvel_in_observation: bool | None = None
-    include_qfrc_actuator_in_observation: bool | None = None
-    include_cfrc_ext_in_observation: bool | None = None
+    mass_scale: Annotated[Positive, "factor on masses and inertias"] = 1.0
+    friction_scale: Annotated[Positive, "factor on the friction of all surfaces"] = 1.0
+    damping_scale: Annotated[NotNegative, "factor on the damping of joints"] = 1.0
+    strength_scale: Annotated[NotNegative, "factor on the forces of actuators"] = 1.0
+    reset_noise_scale: Annotated[
+        NotNegative | None, "noise of initial positions [m, rad] and velocities [m/s, rad/s]"
+    ] = None
+    exclude_current_positions_from_observation: Annotated[bool, "hide the root's place"] = True
+    include_cinert_in_observation: Annotated[bool | None, "observe masses and inertias"] = None
+    include_cvel_in_observation: Annotated[bool | None, "observe the velocities of bodies"] = None
+    include_qfrc_actuator_in_observation: Annotated[bool | None, "observe actuator forces"] = None
+    include_cfrc_ext_in_observation: Annotated[bool | None, "observe contact forces"] = None
 
     # reward
-    forward_reward_weight: Number  # per m/s
-    ctrl_cost_weight: Number  # per squared control
-    contact_cost_weight: Number | None = None  # per squared force [N², N²m²]
-    contact_cost_range: Interval | None = None  # of the weighted sum
-    contact_force_range: Interval | None = None  # of every force [N, N m]
-    healthy_reward: Number | None = None
+    forward_reward_weight: Annotated[Number | None, "reward per m/s"] = None
+    ctrl_cost_weight: Annotated[Number | None, "loss of reward per squared control"] = None
+    contact_cost_weight: Annotated[Number | None, "the same per squared force [N², N²m²]"] = None
+    contact_cost_range: Annotated[Interval | None, "range of the weighted sum"] = None
+    contact_force_range: Annotated[Interval | None, "range of every force [N, N m]"] = None
+    healthy_reward: Annotated[Number | None, "reward per step of a healthy robot"] = None
 
     # what ends an episode
-    terminate_when_unhealthy: bool | None = None
-    healthy_z_range: Interval | None = None  # height of the torso [m]
-    healthy_angle_range: Interval | None = None  # of the torso [rad]
-    healthy_state_range: Interval | None = None  # of all other positions and velocities
+    terminate_when_unhealthy: Annotated[bool | None, "whether it ends when the robot falls"] = None
+    healthy_z_range: Annotated[Interval | None, "height of the torso [m]"] = None
+    healthy_angle_range: Annotated[Interval | None, "angle of the torso [rad]"] = None
+    healthy_state_range: Annotated[Interval | None, "all other positions and velocities"] = None
 
     def __post_init__(self) -> None:
-        _check_keys(self.robot, self.to_dict())
-        for key, default in RUNNERS[self.robot].defaults.items():
-            value, values = getattr(self, key), _VALUES[key]
-            if value is None or not values.hold(value):
-                raise ConfigError(
-                    f"Configuration key '{key}' must be {values.words.removesuffix(', or null')}, "
-                    f"got {value!r}."
-                )
-            kind = type(default)
-            value = tuple(map(float, value)) if kind is tuple else kind(value)
-            object.__setattr__(self, key, value)
+        if self.robot not in RUNNERS:
+            hint = did_you_mean(str(self.robot), RUNNERS)
+            raise ConfigError(f"'robot' must be one of {list(RUNNERS)}, got {self.robot!r}.{hint}")
+        own = RUNNERS[self.robot].defaults
+        for row in fields(self)[1:]:
+            value = getattr(self, row.name)
+            if row.default is None and row.name not in own:
+                if value is not None:
+                    raise ConfigError(f"Robot '{self.robot}' has no key '{row.name}'.")
+                continue
+            value = own.get(row.name) if value is None else value
+            vars(self)[row.name] = checked(row.name, ANNOTATIONS[row.name], value)
 
     @classmethod
     def from_dict(cls, keys: Mapping[str, Any]) -> VelocityConfig:
-        """Make a configuration from a robot's defaults and other values for some keys.
+        """Make a configuration from a mapping of keys.
 
         Raises:
             ConfigError: For an unknown robot or key, or a value that cannot be used.
         """
-        if "robot" not in keys:
-            raise ConfigError(f"The configuration lacks 'robot', one of {list(RUNNERS)}.")
-        _check_keys(keys["robot"], keys)
-        return cls(**{**RUNNERS[keys["robot"]].defaults, **keys})
+        for name in keys:
+            if name not in ANNOTATIONS:
+                hint = on_cpu_only(name) or did_you_mean(str(name), ANNOTATIONS)
+                raise ConfigError(f"A velocity environment has no key '{name}'.{hint}")
+        return cls(**keys)
 
     def replace(self, **changes: Any) -> VelocityConfig:
         """Return a copy with some keys changed; another `robot` starts from its own defaults."""
@@ -195,22 +182,15 @@ class VelocityConfig:
         return {key: value for key, value in vars(self).items() if value is not None}
 
 
-def _check_keys(robot: Any, given: Any) -> None:
-    if not isinstance(robot, str) or robot not in RUNNERS:
-        hint = did_you_mean(robot, RUNNERS) if isinstance(robot, str) else ""
-        raise ConfigError(f"'robot' must be one of {list(RUNNERS)}, got {robot!r}.{hint}")
-    known = ["robot", *RUNNERS[robot].defaults]
-    for key in given:
-        if key not in known:
-            hint = on_cpu_only(key) or f"{did_you_mean(str(key), known)} It has {sorted(known)}."
-            raise ConfigError(f"Robot '{robot}' has no configuration key '{key}'.{hint}")
+ANNOTATIONS = get_type_hints(VelocityConfig, include_extras=True)
 
-
-_ANNOTATIONS = get_type_hints(VelocityConfig, include_extras=True)
-_VALUES = {key: values_of(annotation) for key, annotation in _ANNOTATIONS.items()}
-
-VELOCITY_SUITE: dict[str, VelocityConfig] = {
-    f"Safe{row.gymnasium_id.removesuffix('-v5')}Velocity": VelocityConfig.from_dict({"robot": name})
+_COMMON = {row.name: row.default for row in fields(VelocityConfig) if row.default is not None}
+VELOCITY_SUITE: dict[str, dict[str, Any]] = {
+    f"Safe{row.gymnasium_id.removesuffix('-v5')}Velocity": {
+        **_COMMON,
+        "robot": name,
+        **row.defaults,
+    }
     for name, row in RUNNERS.items()
 }
 
@@ -227,7 +207,7 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
     """
     if isinstance(env, VelocityConfig):
         return env
-    if isinstance(env, Mapping):
+    if not isinstance(env, str):
         return VelocityConfig.from_dict(env)
     name = env.removesuffix("-v1")
     if name.startswith("Safety"):
@@ -237,4 +217,4 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
             f"Unknown environment '{env}'.{did_you_mean(name, VELOCITY_SUITE)} The velocity family "
             f"has {', '.join(VELOCITY_SUITE)}."
         )
-    return VELOCITY_SUITE[name]
+    return VelocityConfig(**VELOCITY_SUITE[name])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, ClassVar
 
 import mujoco
@@ -90,7 +91,6 @@ class VelocityEnv(SimulatedEnv):
         self._observation = torch.zeros(num_envs, self._observer.size)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
         self._starts = Starts(self.config, self._model, num_envs)
-        self._renderer = RobotRenderer(self.config, self._physics)
         observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
         self._announce(self._model, observed, highest=1.0, seed=seed)
 
@@ -121,7 +121,7 @@ class VelocityEnv(SimulatedEnv):
         truncated = (self._step_count >= self.config.num_steps) & ~terminated
         cost = self._has_cost.to(torch.float64)
         flags = torch.stack([terminated | truncated, terminated, truncated])
-        return self._step_output(torch.stack([reward, cost, cost]), flags)
+        return self._output(flags, torch.stack([reward, cost, cost]))
 
     def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
         """Take one step; returns reward and termination, float64 and bool [N]."""
@@ -149,6 +149,10 @@ class VelocityEnv(SimulatedEnv):
         if self.config.robot not in HEALTH:
             return torch.ones(self.batch_size, dtype=torch.bool)
         return HEALTH[self.config.robot](self.config, self._physics.qpos, self._physics.qvel)
+
+    @cached_property
+    def _renderer(self) -> RobotRenderer:
+        return RobotRenderer(self.config, self._physics)
 
     def _read_state(self) -> TensorDict:
         state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}

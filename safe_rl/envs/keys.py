@@ -1,0 +1,121 @@
+"""Keys of environments: a type with its range, a default and a meaning each, also for Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import field, make_dataclass
+from functools import cache, partial
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Optional, Union, get_args, get_origin
+
+from annotated_types import Interval
+from pydantic import ValidationError
+
+from safe_rl import checks
+from safe_rl.checks import SettingError, Share, Text
+from safe_rl.envs.errors import ConfigError
+
+__all__ = ["Count", "Key", "NotNegative", "Number", "Positive", "Share", "Text", "checked"]
+
+# float32 can hold the square of the largest number
+Number = Annotated[float, Interval(ge=-1e9, le=1e9)]
+Positive = Annotated[float, Interval(gt=0, le=1e9)]
+NotNegative = Annotated[float, Interval(ge=0, le=1e9)]
+Count = Annotated[int, Interval(ge=1, le=10**15)]
+
+
+class Key(NamedTuple):
+    """A configuration key.
+
+    Attributes:
+        default: Its default value.
+        annotation: Its type and range, such as `float | None` or pydantic's `PositiveFloat`.
+        meaning: Its meaning, for the table of keys.
+    """
+
+    default: Any
+    annotation: Any
+    meaning: str = ""
+
+
+adapter = cache(checks.adapter)
+
+
+def checked(name: str, annotation: Any, value: Any) -> Any:
+    """Return a value with the type of its key; ConfigError if the type or range is wrong."""
+    try:
+        return adapter(annotation).validate_python(_plain(value))
+    except ValidationError:
+        try:
+            return checks.check_value(name, annotation, _plain(value))
+        except SettingError as error:
+            raise ConfigError(str(error)) from None
+
+
+def _plain(value: Any) -> Any:
+    """Return numbers of NumPy and torch as Python's, and their arrays, lists, … as tuples."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+        return value
+    return tuple(map(_plain, value))
+
+
+def describe(annotation: Any) -> str:
+    """Return the allowed values of an annotation in words.
+
+    Examples:
+        >>> describe(Share | None)
+        'number from 0 to 1, or null'
+    """
+    return _words(adapter(annotation).json_schema())
+
+
+def _words(schema: Mapping[str, Any]) -> str:
+    if "anyOf" in schema:
+        return ", or ".join(map(_words, schema["anyOf"]))
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    kind = schema.get("type", "anything")
+    if kind == "array":
+        items = schema.get("prefixItems") or [schema["items"]]
+        number = f"{len(items)} times " if "prefixItems" in schema else ""
+        return f"list of {number}{_words(items[0])}"
+    words = {"string": "text", "boolean": "true or false"}.get(kind, kind)
+    bounds = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to"}
+    for name, word in bounds.items():
+        if name in schema and abs(schema[name]) < 1e9:
+            words += f" {word} {schema[name]:,g}"
+    return words
+
+
+def structured(name: str, keys: Mapping[str, Key]) -> type:
+    """Return a dataclass of keys for Hydra's ConfigStore.
+
+    Hydra then refuses unknown keys and wrong types. Ranges, choices and nested lists, which it
+    cannot express, are checked when the environment is made.
+    """
+    rows = []
+    for key_name, row in keys.items():
+        kind, default = _hydra_type(row.annotation), row.default
+        if isinstance(default, tuple):
+            default = field(default_factory=partial(list, default))
+        rows.append((key_name, kind, default))
+    return make_dataclass(name, rows)
+
+
+def _hydra_type(annotation: Any) -> Any:
+    """Return the most special type that OmegaConf knows for an annotation."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _hydra_type(inner[0])
+    if origin is Literal:
+        return type(inner[0])
+    if origin in (Union, UnionType):
+        kinds = {_hydra_type(kind) for kind in inner if kind is not NoneType}
+        kind = kinds.pop() if len(kinds) == 1 else Any
+        return Optional[kind] if NoneType in inner else kind  # noqa: UP045, as kind may be Any
+    if origin in (list, tuple):
+        item = _hydra_type(inner[0])
+        return list[item] if item in (bool, int, float, str) else Any  # type: ignore[valid-type]
+    return annotation if annotation in (bool, int, float, str) else Any
