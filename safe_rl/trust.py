@@ -37,6 +37,9 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
 }
 
 
+_PACKAGED = frozenset(_ROOMS)
+
+
 class TargetError(SettingError):
     """A ``_target_`` that a configuration may not name, or that does not exist."""
 
@@ -50,6 +53,11 @@ def allow(module: str) -> None:
         Fraction(3, 4)
     """
     _ROOMS[module] = None
+
+
+def allowed() -> list[str]:
+    """The user's modules that configurations may name, for other processes to import."""
+    return [name for name in _ROOMS if name not in _PACKAGED]
 
 
 def instantiate(

@@ -39,7 +39,7 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
-    from safe_rl.cli.evaluating import certify_run
+    from safe_rl.training.train import certify_run
 
     names = ("certify", "certificate", "deterministic", "num_threads")
     read = {name: getattr(options, name) for name in names}

@@ -7,25 +7,26 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from signal import SIGINT
 from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.core.config_store import ConfigStore
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
 from safe_rl.cli.composing import check_risk, compose_run, overrides_of
-from safe_rl.cli.evaluating import certify_run, evaluate_run, evaluate_varied
+from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
 from safe_rl.cli.options import make_options
 from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
-from safe_rl.cli.run_folders import maker_of
 from safe_rl.cli.schema import check_settings
-from safe_rl.cli.session import Session
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
 from safe_rl.evaluation.episodes import default_seed
@@ -36,11 +37,11 @@ from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.display import outcome_line
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
+from safe_rl.training import train as training
+from safe_rl.training.train import Callback, certify_run
 
 if TYPE_CHECKING:
     import pandas
-
-Callback = Callable[[Mapping[str, float]], Any]
 
 
 def train(
@@ -97,8 +98,8 @@ def train(
     config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
     check_settings(config)
     check_risk(config)
-    folder = None if directory is None else Path(directory).expanduser()
-    return _carry_out(Session(config, folder, program=None, callbacks=callbacks))
+    folder = new_folder(config.hydra) if directory is None else Path(directory).expanduser()
+    return _carry_out(config, folder, callbacks)
 
 
 def resume(
@@ -136,17 +137,35 @@ def resume(
     ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
     config = compose_run(words, name=RESUMED)
     refuse_changes(folder.absolute(), config)
-    return _carry_out(Session(config, folder, continues=True, program=None, callbacks=callbacks))
+    return _carry_out(config, folder, callbacks, continues=True)
 
 
-def _carry_out(session: Session) -> Run:
+def new_folder(hydra: DictConfig) -> Path:
+    """Make the folder of a new run; if it exists, its name gets a number.
+
+    A folder that an override names is used as it is.
+    """
+    wanted = Path(hydra.run.dir).expanduser().absolute()
+    if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
+        return wanted
+    for number in count(1):
+        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        with suppress(FileExistsError):  # of a run that began in the same second
+            path.mkdir(parents=True)
+            break
+    return path
+
+
+def _carry_out(
+    config: DictConfig, folder: Path, callbacks: Sequence[Callback], *, continues: bool = False
+) -> Run:
     try:
-        session.run()
+        training.train(config, folder, continues=continues, callbacks=callbacks, program=None)
     except SystemExit as end:
         if end.code == 128 + SIGINT:
             raise KeyboardInterrupt from None
         raise
-    return Run(session.folder.directory)
+    return Run(folder)
 
 
 def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
@@ -284,7 +303,7 @@ class Run(RecordedRun):
         """
         node = loading.override_env(self.config, keys)
         seed = default_seed(node, self.config.seed) if seed is None else seed
-        make = loading.for_evaluation(maker_of(self.directory), self.config)
+        make = loading.for_evaluation(loading.maker_of(self.directory), self.config)
         return make(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:

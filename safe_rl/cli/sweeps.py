@@ -43,7 +43,7 @@ def run_in_sweep(config: DictConfig, settings: DictConfig, directory: Path) -> f
     Returns:
         The value that an optimising sweeper maximises; −∞ if the job fails.
     """
-    from safe_rl.cli.session import run_job  # with torch: a sweep starts without it
+    from safe_rl.training.train import run_job  # with torch: a sweep starts without it
 
     folder = Run(directory)
     try:
@@ -53,7 +53,7 @@ def run_in_sweep(config: DictConfig, settings: DictConfig, directory: Path) -> f
         check_risk(config)
         with open_dict(config):
             config.hydra = settings
-        value = run_job(config, settings)
+        value = run_job(config, directory)
     except Exception as error:
         summary = f"{type(error).__name__}: {' '.join(str(error).split())}"
         print(f"{directory}: {summary}", file=sys.stderr)

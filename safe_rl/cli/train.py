@@ -108,36 +108,34 @@ def job(config: DictConfig) -> float | None:
     directory = Path(settings.runtime.output_dir)
     if settings.mode == RunMode.MULTIRUN:
         return run_in_sweep(config, settings, directory)
+    is_resumed = settings.job.config_name == RESUMED
     try:
-        _run(config, settings, directory)
+        _check(config, settings, directory)
     except (OmegaConfBaseException, ValueError) as error:
-        sys.exit(explain(error, sys.argv[1:]))
-    finally:
         with suppress(OSError):
             directory.rmdir()  # Hydra has made it; a folder with files stays
+        sys.exit(explain(error, sys.argv[1:]))
+    if not is_resumed:
+        with open_dict(config):
+            config.hydra = settings
+    from safe_rl.training.train import is_expected, train  # torch: help and errors do not need it
+
+    try:
+        train(config, directory, continues=is_resumed)
+    except Exception as error:
+        if not is_expected(error):
+            raise
+        sys.exit(" ".join(str(error).split()))
     return None
 
 
-def _run(config: DictConfig, settings: DictConfig, directory: Path) -> None:
-    is_resumed = settings.job.config_name == RESUMED
-    if is_resumed:
+def _check(config: DictConfig, settings: DictConfig, directory: Path) -> None:
+    if settings.job.config_name == RESUMED:
         refuse_changes(directory, config)
     else:
         name_choices(config, settings.runtime.choices)
     check_settings(config)
     check_risk(config)
-    if not is_resumed:
-        with open_dict(config):
-            config.hydra = settings
-    from safe_rl.cli.session import Session  # with torch: help and errors do not need it
-
-    session = Session(config, directory, continues=is_resumed, program="python train.py")
-    try:
-        session.run()
-    except Exception as error:
-        if not session.refuses(error):
-            raise
-        sys.exit(" ".join(str(error).split()))
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")

@@ -1,7 +1,12 @@
-"""Load the environment and the trained policy of a run from its folder."""
+"""Load the environment and the trained policy of a run from its folder.
+
+A run is continued and evaluated with the robot that it began with, even if the user's file, which
+the configuration names, has changed.
+"""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -14,8 +19,12 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.envs import ConfigError, ConstrainedEnv, make_env
+from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
+from safe_rl.files import read_json, replace_json
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, check_interface
+from safe_rl.runs.run import Run
 
 
 def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -38,6 +47,60 @@ def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Call
     """`make_env` for evaluations of a run, with the transforms of the run if it has any."""
     transforms = transforms_of(config)
     return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
+
+
+def keep_robot(run: Run, env: Mapping[str, Any]) -> None:
+    """Note which custom robot a run begins with, and copy its files.
+
+    If the files cannot be copied, the note has their hash only, and the reason is printed.
+    """
+    robot = _own_robot(env)
+    if robot is None:
+        return
+    shutil.rmtree(run.robot_folder, ignore_errors=True)
+    note = {"robot_base": env["robot_base"], "sha256": fingerprint(robot), "file": None}
+    try:
+        note["file"] = str(copy_robot(robot, run.robot_folder).relative_to(run.robot_folder))
+    except ConfigError as error:
+        shutil.rmtree(run.robot_folder, ignore_errors=True)
+        print(f"{error} The run keeps no copy of its robot: it needs that file as it is now.")
+    replace_json(run.robot_file, note)
+
+
+def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an environment's node with the robot that a run began with.
+
+    A node that names another robot, or a run that has not begun, changes nothing.
+
+    Raises:
+        ConfigError: If the file of the robot is gone, or has changed.
+    """
+    if not run.robot_file.is_file():
+        return dict(env)
+    note = read_json(run.robot_file)
+    if not (isinstance(note, dict) and {"robot_base", "sha256", "file"} <= note.keys()):
+        raise ConfigError(f"{run.robot_file} is not as a run writes it.")
+    if note["robot_base"] != env.get("robot_base"):
+        return dict(env)
+    original, content = _own_robot(env), note["sha256"]
+    path = run.robot_folder / str(note["file"]) if note["file"] else original
+    if path is None or not path.is_file():
+        raise ConfigError(f"'robot_base': there is no file {path}, with which the run began.")
+    home = run.robot_folder if note["file"] else Path(path.anchor or ".")
+    if not is_robot(path, home, content):
+        raise ConfigError(f"'robot_base': {path} has changed since the run began.")
+    return {**env, "robot_base": str(path)}
+
+
+def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:
+    """:func:`safe_rl.make_env` for a run's environments, with the robot that it began with."""
+    run = Run(directory)
+    return lambda env, **options: make_env(robot_of(run, env), **options)
+
+
+def _own_robot(env: Mapping[str, Any]) -> Path | None:
+    """The user's robot file, if any; environments of other families have none."""
+    return own_robot(env) if env.get("_target_") is None and "robot_base" in env else None
 
 
 def load_policy(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 from annotated_types import Interval
+from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.checks import Fraction, Share, check_value, rule
+from safe_rl.files import CONF
+from safe_rl.naming import did_you_mean
 
 PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
@@ -136,3 +140,25 @@ def check_options(options: EvaluationOptions) -> None:
     folder = Path(options.picture or "").parent
     if not folder.is_dir():
         raise ValueError(f"picture={options.picture}: there is no folder {folder}.")
+
+
+def certificate_options(
+    config: DictConfig, changes: Mapping[str, Any] | None = None
+) -> CertificateOptions:
+    """The options of a run's certificate, from its sections ``certificate`` and ``risk``.
+
+    With ``risk=chance`` the share of episodes above the limit is certified as well; with
+    ``risk=cvar`` the mean cost of the costliest episodes.
+    """
+    options = dict(config.certificate)
+    for name, value in (changes or {}).items():
+        if name not in options:
+            raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
+        kind = get_type_hints(CertificateOptions, include_extras=True)[name]
+        options[name] = check_value(f"certificate.{name}", kind, value)
+    if not options["episodes"]:  # training was to end without a certificate
+        options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
+    # with risk=mean the section may still have numbers, such as the tail of WCSAC's critics
+    risk = config.risk if OmegaConf.select(config, "risk._target_") else {}
+    share = min(options["most_over"], risk.get("most_over", 1.0))
+    return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))

@@ -192,19 +192,16 @@ def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
     return given | {"env": config.env.name, "algo": config.algo.name, "seed": config.seed}
 
 
-def check_same_run(directory: Path, config: DictConfig) -> None:
+def check_same_run(run: Run, config: DictConfig) -> None:
     """Refuse to continue a run with other settings; length and machine may differ.
 
     Raises:
         ValueError: If other settings differ; the message names every key.
     """
-    run = Run(directory)
-    if not run.is_run:
-        return
     given = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
     if found := differences(run.settings, given):
         changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
         raise ValueError(
-            f"{directory} holds a run with other settings ({changes}). Move it away, or give the "
-            "sweep another folder with hydra.sweep.dir=..."
+            f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
+            "the sweep another folder with hydra.sweep.dir=..."
         )

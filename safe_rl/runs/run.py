@@ -84,7 +84,6 @@ class Run:
     code_file = _Below("code.json")  # versions of the code
     checkpoints_folder = _Below("checkpoints")  # a folder for each of `KINDS`
     transitions_folder = _Below("transitions")  # collected transitions, if they were recorded
-    certifying_file = _Below(".certifying")  # exists between training and certificate
     certificate_file = _Below("certificate.json")  # which checkpoint is certified
     tests_file = _Below("certificate_tests.json")  # the error that the tests of it have spent
 

@@ -76,7 +76,7 @@ class Trainer:
         self.progress = Progress()
         self.writer = writer
         self.episode_length = env.max_episode_steps
-        self.interrupted_by: Signals | None = None
+        self.stopped_by: Signals | None = None
         self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
         self._collector = collector
         self._env = env
@@ -153,6 +153,11 @@ class Trainer:
         """Whether a resumed run begins new episodes, because checkpoints have no environments."""
         return self._snapshot is None
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether no signal has ended the training before its last step."""
+        return self.stopped_by is None or self.progress.steps >= self._frames
+
     def _begin_episodes(self) -> None:
         """Begin new episodes if the state of the environments was not saved."""
         if self._snapshot is not None:
@@ -175,7 +180,7 @@ class Trainer:
         """Train for ``frames`` steps, rounded up to whole batches.
 
         Ctrl-C, SIGTERM or SIGHUP ends the run after the current epoch, with a checkpoint. Then
-        ``interrupted_by`` is the signal, unless that epoch was the last one.
+        ``stopped_by`` is the signal.
 
         Returns:
             One line about the outcome.
@@ -224,9 +229,8 @@ class Trainer:
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
-            if self.progress.steps < self._frames and stop.received:
-                self.interrupted_by = stop.received
-            else:
+            self.stopped_by = stop.received
+            if self.is_finished:
                 # before the last checkpoint is written, which marks the run as finished
                 self._keep(self._candidates.judge_all())
             self._save()

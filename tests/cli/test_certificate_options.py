@@ -4,7 +4,7 @@ import pytest
 from run_configs import compose_config
 
 from safe_rl.cli.composing import is_to_keep_limits
-from safe_rl.cli.evaluating import certificate_options
+from safe_rl.evaluation.settings import certificate_options
 
 
 @pytest.mark.parametrize(

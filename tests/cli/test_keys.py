@@ -16,8 +16,8 @@ from safe_rl import trust
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.checks import is_setting, parameters_of
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.session import SETTING_ERRORS
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve
+from safe_rl.training.train import SETTING_ERRORS
 
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
 WRONG: list[Any] = [

@@ -221,14 +221,15 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
 def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch):
     given = []
     monkeypatch.setattr(
-        "safe_rl.cli.session.certify_run", lambda *said, **options: given.append((*said, options))
+        "safe_rl.training.train.certify_run",
+        lambda *said, **options: given.append((*said, options)),
     )
-    note = run.directory / ".certifying"
-    note.touch()
-    safe_rl.resume(run.directory)
-    note.unlink()
-    changes = run.config.certificate
-    assert given == [(run.directory, {"num_threads": 1, "changes": changes})]
+    run.certificate_file.unlink()
+    safe_rl.resume(run.directory, **{"certificate.episodes": 4})
+    ((directory, options),) = given
+    assert directory == run.directory
+    assert options["num_threads"] == 1
+    assert options["changes"] == {**run.config.certificate, "episodes": 4}
 
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():

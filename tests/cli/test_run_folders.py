@@ -7,8 +7,7 @@ import pytest
 from commands import SMALL, in_a_process, status_of
 from omegaconf import OmegaConf
 
-from safe_rl.cli import session
-from safe_rl.cli.run_folders import new_folder
+from safe_rl.cli.python_api import new_folder
 from safe_rl.runs.folder import RunInUseError
 
 
@@ -18,7 +17,7 @@ def hydra_config(directory, *overrides):
 
 
 def claim(directory):
-    return new_folder(hydra_config(directory))[0]
+    return new_folder(hydra_config(directory))
 
 
 def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
@@ -33,7 +32,7 @@ def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
 @pytest.mark.parametrize("override", ["hydra.run.dir", "+hydra.run.dir"])
 def test_a_folder_that_was_named_stays(tmp_path, override):
     config = hydra_config(tmp_path, f"{override}={tmp_path}")
-    assert new_folder(config) == (tmp_path, False)
+    assert new_folder(config) == tmp_path
     assert not list(tmp_path.iterdir())
 
 
@@ -42,7 +41,7 @@ def test_a_folder_that_another_process_makes_first_stays(tmp_path, monkeypatch):
         (file.parent / "robot").mkdir(parents=True)
         raise RunInUseError("in use")
 
-    monkeypatch.setattr(session, "lock_folder", refuse)
+    monkeypatch.setattr("safe_rl.training.train.lock_folder", refuse)
     assert status_of(*SMALL, f"hydra.run.dir={tmp_path / 'run'}") == "in use"
     assert (tmp_path / "run" / "robot").is_dir()
 

@@ -14,7 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from safe_rl.cli import session
 from safe_rl.cli.sweeps import Summary, run_in_sweep
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.display import LINE_SECONDS, ProgressBar
@@ -38,8 +37,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     summary = Summary(f"{tmp_path}/jobs.jsonl")
     outcomes = {0: 3.5, 1: ValueError("no such cost\nmore"), 2: SystemExit(130)}
 
-    def run_job(config, hydra):
-        outcome = outcomes[hydra.job.num]
+    def run_job(config, directory):
+        outcome = outcomes[int(directory.name.removeprefix("seed"))]
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
@@ -55,7 +54,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         run_in_sweep(made, config.hydra, directory)
         summary.on_job_end(config)
 
-    monkeypatch.setattr(session, "run_job", run_job)
+    monkeypatch.setattr("safe_rl.training.train.run_job", run_job)
+    monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")
     carry_out(0)

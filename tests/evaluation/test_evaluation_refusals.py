@@ -91,7 +91,7 @@ def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, m
     def make(*node, **options):
         raise ContractError("mine was asked for 25 environments and made 20")
 
-    monkeypatch.setattr("safe_rl.cli.run_folders.envs.make_env", make)
+    monkeypatch.setattr("safe_rl.evaluation.loading.make_env", make)
     assert main([str(run)]) == 1
     assert "error: mine was asked for 25" in capsys.readouterr().err
 

@@ -1,0 +1,133 @@
+"""A run from its beginning to its certificate: what stops it, what continues it, what is left."""
+
+import os
+import signal
+
+import pytest
+from run_configs import compose_config
+
+from safe_rl.runs.folder import RunInUseError, lock_folder
+from safe_rl.runs.run import Run
+from safe_rl.training import train as module
+from safe_rl.training.train import run_job, train
+from safe_rl.training.trainer import Trainer
+
+SMALL = (
+    *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "frames=80", "logger=none"),
+    *("model.hidden_sizes=[8]", "critic_update.minibatch_size=20", "num_threads=1"),
+    *("certificate.ranking=2", "certificate.episodes=4", "certificate.tests=1"),
+)
+
+
+def small(*overrides):
+    return compose_config(*SMALL, "policy_update.minibatch_size=20", *overrides)
+
+
+def stop_in(epoch):
+    def callback(row):
+        if row["epoch"] == epoch:
+            signal.raise_signal(signal.SIGTERM)
+
+    return [callback]
+
+
+def test_a_signal_in_the_last_epoch_leaves_the_certificate_to_the_next_start(tmp_path, capsys):
+    with pytest.raises(SystemExit) as end:
+        train(small(), tmp_path / "run", callbacks=stop_in(2))
+    assert end.value.code == 128 + signal.SIGTERM
+    assert "Interrupted before it was certified. To do so:" in capsys.readouterr().out
+    run = Run(tmp_path / "run")
+    assert run.is_finished
+    assert run.certificate is None
+    train(small(), run.directory, continues=True)
+    assert run.certificate["most_episodes"] == 4
+    # with nothing left to do, a signal in the last epoch interrupts nothing
+    train(small("certificate.episodes=0"), tmp_path / "done", callbacks=stop_in(2))
+
+
+def test_a_job_that_dies_before_its_certificate_is_certified_by_the_next_sweep(
+    tmp_path, monkeypatch
+):
+    """It has its last checkpoint, so it counts as finished."""
+
+    class Killed(BaseException):
+        pass
+
+    train_on = Trainer.run
+
+    def die(trainer):
+        train_on(trainer)
+        raise Killed
+
+    monkeypatch.setattr(Trainer, "run", die)
+    with pytest.raises(Killed):
+        run_job(small(), tmp_path / "run")
+    monkeypatch.undo()
+    assert run_job(small(), tmp_path / "run") > -1e9
+    assert Run(tmp_path / "run").certificate["candidates"][-1] == 80
+    monkeypatch.setattr(module, "certify", lambda *_, **__: pytest.fail("certified twice"))
+    run_job(small(), tmp_path / "run")
+
+
+def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, monkeypatch):
+    """An environment without ``num_steps``: 500 steps, not 1,000."""
+    words = ("env=gymnasium", "env.id=CartPole-v1", "env.outside={cost_far: [0, -1, 1]}")
+    words += ("cost_limits={cost_far: 5}", "frames=500", "frames_per_batch=500", "num_envs=2")
+    config = [*words, "logger=none", "num_threads=1", "certificate.ranking=2"]
+    train(compose_config(*config, "certificate.episodes=0"), tmp_path / "run")
+    tested = []
+    monkeypatch.setattr(module, "certify", lambda directory, *_, **__: tested.append(directory))
+    train(compose_config(*config, "certificate.episodes=5"), tmp_path / "run", continues=True)
+    assert tested == [tmp_path / "run"]
+
+
+def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
+    run = train(small("certificate.episodes=0"), tmp_path / "run")
+    monkeypatch.setattr(module, "certify", lambda *_, **__: pytest.fail("tested without the lock"))
+    ready, proceed = os.pipe(), os.pipe()
+    child = os.fork()
+    if not child:
+        with lock_folder(run.lock_file):
+            os.write(ready[1], b"x")
+            os.read(proceed[0], 1)
+        os._exit(0)
+    os.read(ready[0], 1)
+    try:
+        with pytest.raises(RunInUseError):
+            module.certify_run(run.directory)
+    finally:
+        os.write(proceed[1], b"x")
+        os.waitpid(child, 0)
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path):
+    run = train(small("certificate.episodes=0"), tmp_path / "run")
+    mark = "0123456789abcdef"
+    left = [run.directory / f".config.{mark}.yaml", run.directory / f".curves.{mark}.png"]
+    left.append(run.checkpoints_folder / "last" / f".checkpoint-000000000040.{mark}.torchrl")
+    kept = run.directory / f".evaluation.{mark}.json"  # of an evaluation that is running
+    for path in (*left, kept):
+        path.touch()
+    train(small("certificate.episodes=0"), run.directory, continues=True)
+    assert not any(path.exists() for path in left)
+    assert kept.exists()
+
+
+def test_a_run_that_cannot_begin_leaves_no_folder(tmp_path):
+    (tmp_path / "made_by_hydra").mkdir()
+    for name in ("new", "made_by_hydra"):
+        with pytest.raises(ValueError, match="frames_per_batch"):
+            train(small("frames_per_batch=3", "num_envs=2"), tmp_path / name)
+        assert not (tmp_path / name).exists()
+
+
+def test_an_error_of_training_that_no_setting_explains_keeps_its_traceback(tmp_path):
+    def fail(row):
+        raise ValueError("in a callback")
+
+    with pytest.raises(ValueError, match="in a callback") as caught:
+        train(small(), tmp_path / "run", callbacks=[fail])
+    assert not module.is_expected(caught.value)
+    with pytest.raises(FileExistsError) as caught:
+        train(small(), tmp_path / "run")
+    assert module.is_expected(caught.value)
