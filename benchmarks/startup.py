@@ -2,7 +2,7 @@
 
 Every figure is a median over several new processes: of the imports of torch and TorchRL, of the
 further time of `import safe_rl.envs`, of `train.py` until the first step, and of `train.py` with
-20,000 steps, one epoch of the default preset. With compile=true, the compiler's cache is empty.
+20,000 steps, one epoch with the defaults. With compile=true, the compiler's cache is empty.
 
     python benchmarks/startup.py env=PointGoal1 algo=ppo_lagrangian
 """

@@ -25,20 +25,20 @@ from safe_rl.objectives.risk import PenalisedCosts, cost_so_far
 
 
 class QuadraticPenaltyLoss(PPOLoss):
-    """PPO's loss + strength · Σᵢ (E[ρAᵢ] + (J_cᵢ − dᵢ) / T̄)₊²."""
+    """PPO's loss + kappa · Σᵢ (E[ρAᵢ] + (J_cᵢ − dᵢ) / T̄)₊²."""
 
     extra_out_keys = ("loss_penalty", "clip_fraction")
     has_costs = True
 
-    def __init__(self, actor_network, *, strength: float, **settings) -> None:
+    def __init__(self, actor_network, *, kappa: float, **settings) -> None:
         super().__init__(actor_network, **settings)
-        self.strength = strength
+        self.kappa = kappa
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)  # [k]
         excess = self.limits.excess(surrogates)  # predicted, above the target, per time step
-        penalty = self.strength * excess.relu().square().sum()
+        penalty = self.kappa * excess.relu().square().sum()
         return super()._surrogates(tensordict, log_weight) | {"loss_penalty": penalty}
 
 

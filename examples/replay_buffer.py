@@ -4,7 +4,7 @@
 
 Only networks, loss, multiplier, limits and episode accounting are from this package. Multiplier and
 loss get the state of the limits after every batch, so that λ has the same scale as in `train.py
-algo=sac_lagrangian limits/replay@limits=paper`. The complete algorithm also has pessimistic costs
+algo=sac_lagrangian limits=null`. The complete algorithm also has pessimistic costs
 (`loss.pessimism`), a limit that falls during training, checkpoints, evaluations and a table.
 """
 

@@ -87,7 +87,7 @@ def build_constraints(
     tracker = instantiate(config.get("limits"), known, cost_limits=values)
     if risk is not None and tracker is None:
         raise ValueError(
-            "risk: only the mean cost is limited by the episodes of a batch alone (limits=paper); "
-            "other measures need limits=default."
+            "risk: only the mean cost is limited by the episodes of a batch alone (limits=null); "
+            "other measures need limits, as in conf/algo/cpo.yaml."
         )
     return Constraints(limits, max_length=max_length, tracker=tracker, risk=risk, device=device)

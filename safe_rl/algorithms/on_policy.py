@@ -182,8 +182,8 @@ def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
     limits = constrained_limits(config, env, otherwise="ppo")
     if limits and config.get("cost_advantage") is None:
         raise ValueError(
-            f"algo={config.algo.name} is constrained and has no cost_advantage: add "
-            "'- /cost_advantage: ${preset}' to its defaults, or say algo.constrained=false."
+            f"algo={config.algo.name} is constrained and has no cost_advantage: add that of "
+            "conf/algo/cpo.yaml to its YAML file, or say algo.constrained=false."
         )
     return limits
 

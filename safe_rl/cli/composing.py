@@ -20,7 +20,7 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
@@ -159,6 +159,8 @@ def _hint_of_grammar(text: str) -> str:
 def _unknown_choice(error: MissingConfigException) -> str:
     """A message about a file that does not exist, such as ``env=PointGaol1``."""
     group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if (group, name) == ("preset", "paper"):
+        return "there is no preset 'paper'. For its numbers write algo=paper/cpo, and so on."
     known = list(error.options or ())
     if not known:
         with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -177,10 +179,12 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     """A message about a key that the configuration does not have."""
     others = [word for word in words if not word.lstrip("+~").startswith((f"{given}=", f"{key}="))]
     try:
-        known = list(flatten(_plain(_compose(others))))
+        known = flatten(_plain(_compose(others)))
     except (HydraException, OmegaConfBaseException):
-        known = []
-    meant = [f"'{name}'" for name in nearest_keys(key, known)]
+        known = {}
+    if known.get(section := key.partition(".")[0]) == MISSING:  # a key of `General`
+        return f"this algorithm has no '{section}'."
+    meant = [f"'{name}'" for name in nearest_keys(key, list(known))]
     end = f"Did you mean {' or '.join(meant)}?" if meant else "'--cfg job' prints all keys."
     return f"there is no key '{key}'. {end}"
 

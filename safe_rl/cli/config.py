@@ -217,6 +217,9 @@ class General:
         exploration: Exploration of off-policy algorithms.
         dataset: Transitions that are in the replay buffer from the beginning.
         evaluation: Evaluations while training; null: none.
+        preset: Name of the preset whose keys replace the algorithm's.
+        paper: Numbers of `algo=paper/…` for some robots.
+        default_cost_limits: `cost_limits` unless they are given.
     """
 
     frames: Whole
@@ -255,14 +258,14 @@ class General:
     exploration: Exploration | None
     dataset: Dataset | None
     evaluation: Evaluation | None
-    # until the pages of conf/ have no shared presets
-    preset: Any
+    preset: Text
     paper: Any
-    replay: Any
     default_cost_limits: Any
 
 
 ConfigStore.instance().store(name="general", node=General)
+
+_PARTS = ("critic_update", "memory", "limits", "lagrangian", "advantage", "cost_advantage", "actor")
 
 
 def check_settings(config: DictConfig) -> None:
@@ -277,6 +280,9 @@ def check_settings(config: DictConfig) -> None:
     with open_dict(config):
         for name in [key for key in config if OmegaConf.is_missing(config, key)]:
             del config[name]
+        if config.algo.get("constrained") is False:  # presets have limits for other algorithms
+            config.pop("limits", None)
+    _check_parts(config)
     _check(General, config, "")
     _check(Algo, config.algo, "algo", is_open=True)
     _check(CertificateOptions, config.certificate, "certificate")
@@ -299,6 +305,15 @@ def check_settings(config: DictConfig) -> None:
     cap = config.certificate.get("cap")
     if cap is not None and any(cap <= limit for limit in config.cost_limits.values()):
         raise SettingError(f"certificate.cap={cap}: it must be above every limit of cost_limits.")
+
+
+def _check_parts(config: DictConfig) -> None:
+    """Refuse what a preset or a command has added to an algorithm without such a part."""
+    for name in _PARTS:
+        part = config.get(name)
+        if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):
+            words = "" if config.preset in ("default", "paper") else f"preset={config.preset}: "
+            raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.")
 
 
 def _check(section: type, values: DictConfig, above: str, *, is_open: bool = False) -> None:

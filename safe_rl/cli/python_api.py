@@ -67,7 +67,7 @@ def train(
             run ends like a finished one.
         config_dir: A folder with YAML files of yours, or several, as the command's
             ``--config-dir``.
-        settings: Any key of ``conf/``: ``frames=100_000``, ``preset="paper"``,
+        settings: Any key of ``conf/``: ``frames=100_000``, ``preset="gpu"``,
             ``cost_limits={"cost_hazards": 10}``. Keys below another one are dictionaries,
             ``policy_update={"max_kl": 0.02}``, or written with dots, ``**{"env.hazards_num": 12}``.
 

@@ -22,9 +22,7 @@ allow("custom_loss")
 
 def test_the_penalty_of_a_policy_that_has_not_moved():
     actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-    loss = custom_loss.QuadraticPenaltyLoss(
-        actor, strength=100.0, clip_epsilon=0.2, entropy_coeff=0.0
-    )
+    loss = custom_loss.QuadraticPenaltyLoss(actor, kappa=100.0, clip_epsilon=0.2, entropy_coeff=0.0)
     with torch.no_grad():
         batch = actor(TensorDict(observation=torch.randn(50, 3), batch_size=[50]))
     batch["advantage"], batch["cost_advantage"] = torch.randn(50, 1), torch.zeros(50, 2)

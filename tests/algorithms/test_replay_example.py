@@ -12,7 +12,7 @@ from safe_rl.envs import SafetyGymEnv
 SIZES = ["--num-envs=4", "--frames=12000", "--frames-per-batch=4000", "--updates-per-batch=20"]
 # numbers of the script, and no gradient steps
 SAME = (
-    "env=PointGoal1", "algo=sac_lagrangian", "limits/replay@limits=paper", "lagrangian=replay",
+    "env=PointGoal1", "algo=sac_lagrangian", "limits=null", "lagrangian=replay",
     "lagrangian.init=0", "lagrangian.kp=0.1", "lagrangian.ki=0.05", "lagrangian.saturation=0.5",
     "lagrangian.highest=5", "cost_limits={cost: 1}", "policy_update.updates_per_step=1e-9",
 )  # fmt: skip

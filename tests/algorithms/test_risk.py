@@ -242,8 +242,8 @@ def test_a_tail_costs_more_than_the_mean(tmp_path):
 
 
 def test_limits_of_whole_batches_take_no_tails(tmp_path):
-    with pytest.raises(ValueError, match=r"^risk: .*limits=default"):
-        train(tmp_path, "algo=ppo_lagrangian", "risk=cvar", "limits=paper")
+    with pytest.raises(ValueError, match=r"^risk: .*limits=null"):
+        train(tmp_path, "algo=ppo_lagrangian", "risk=cvar", "limits=null")
 
 
 def test_a_resumed_run_charges_as_if_it_had_never_stopped():

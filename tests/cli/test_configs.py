@@ -1,4 +1,4 @@
-"""Every configuration file composes, and the paper's preset has the paper's numbers."""
+"""Every configuration file composes, and algo=paper/… has the paper's numbers."""
 
 import itertools
 import sys
@@ -9,10 +9,11 @@ from omegaconf import OmegaConf
 from point_mass import PointMass
 from run_configs import CONF, compose_config
 
-from safe_rl.algorithms import OffPolicy, OnPolicy
+from safe_rl.algorithms import OnPolicy
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
+from safe_rl.cli.config import check_settings
 from safe_rl.envs import EXTRAS, SUITE, env_names, env_node
 
 
@@ -21,35 +22,33 @@ def options(group: str) -> list[str]:
 
 
 ALGORITHMS = options("algo")
+PAPER = options("algo/paper")
 # those that preset=hard_tasks is for
 WITH_REPLAY = ("cal", "sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac")
-COMBINATIONS = [
-    (algo, preset)
-    for algo, preset in itertools.product(ALGORITHMS, options("preset"))
-    if preset != "hard_tasks" or algo in WITH_REPLAY
+CHOICES = [
+    *([f"algo={name}"] for name in ALGORITHMS),
+    *([f"algo=paper/{name}"] for name in PAPER),
+    *([f"algo={name}", "preset=hard_tasks"] for name in WITH_REPLAY),
+    *([f"algo={name}", "preset=gpu"] for name in ALGORITHMS if name not in (*WITH_REPLAY, "bc")),
 ]
 # of the groups that only some algorithms have
 LAGRANGIAN = [
     name for name in ALGORITHMS if "- /lagrangian:" in (CONF / "algo" / f"{name}.yaml").read_text()
 ]
-MULTIPLIERS = [name for name in options("lagrangian") if name not in options("preset")]
 
 
 @pytest.mark.parametrize(
-    ("algo", "preset", "env"),
-    [
-        (*names, env)
-        for names, env in zip(
-            COMBINATIONS, itertools.cycle(["PointGoal1", "CarButton2", "DoggoPush0"]), strict=False
-        )
-    ],
+    ("choices", "env"),
+    [*zip(CHOICES, itertools.cycle(["PointGoal1", "CarButton2", "DoggoPush0"]), strict=False)],
+    ids=str,
 )
-def test_every_combination_resolves_and_builds(env, algo, preset):
-    config = compose_config(f"env={env}", f"algo={algo}", f"preset={preset}")
+def test_every_combination_resolves_and_builds(choices, env):
+    config = compose_config(f"env={env}", *choices)
+    check_settings(config)
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    algo = choices[0].rpartition("/")[2].removeprefix("algo=")
     assert plain["env"]["name"] == env
     assert plain["algo"]["name"] == algo
-    assert plain["preset"] == preset
     # episodes of 1000 steps: whole ones, or rows that begin at different points of theirs
     steps = plain["frames_per_batch"] / plain["num_envs"]
     assert steps == plain["env"]["num_steps"] or plain["staggered_starts"]
@@ -64,8 +63,17 @@ def test_every_combination_resolves_and_builds(env, algo, preset):
     assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
 
 
+def test_presets_replace_keys_of_an_algorithm():
+    config = compose_config("algo=ppo_lagrangian", "preset=gpu", "env=PointGoal1", "num_envs=8")
+    assert (config.env.physics, config.num_envs) == ("warp", 8)
+    assert config.policy_update.minibatch_size == config.critic_update.minibatch_size == 16_384
+    config = compose_config("algo=sac_lagrangian", "preset=hard_tasks")
+    assert list(config.transforms) == ["observed_costs", "action_repeat"]
+    assert (config.loss.gamma, config.memory.n_steps) == (0.98, 3)
+
+
 @pytest.mark.parametrize("algo", LAGRANGIAN)
-@pytest.mark.parametrize("multiplier", MULTIPLIERS)
+@pytest.mark.parametrize("multiplier", options("lagrangian"))
 def test_multipliers_are_interchangeable(algo, multiplier):
     names = (f"algo={algo}", f"lagrangian={multiplier}")
     config = compose_config("env=PointMass", *names)
@@ -98,7 +106,7 @@ def test_learning_rates_are_given_by_the_names_of_parameters():
     assert max(rates.values()) == config.policy_update.optimizer.lr
 
 
-# The whole of what decides how a run learns with preset=paper, from the paper's section 5.2 and the
+# The whole of what decides how a run of algo=paper/… learns, from the paper's section 5.2 and the
 # code published with it. A number that is in the configuration and not here fails the tests.
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "fused": True}
 DISCOUNT = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
@@ -121,10 +129,7 @@ SHARED = {
     "cost_limits": {"cost": 25.0},
     "risk": {"_target_": None},
 }
-COSTS = {
-    "cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT},
-    "limits": {"_target_": None},
-}
+COSTS = {"cost_advantage": {"_target_": "safe_rl.objectives.CostGAE", **DISCOUNT}}
 MULTIPLIER = {
     "lagrangian": {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.05}
 }
@@ -141,43 +146,13 @@ CPO = {
         "largest_demand": None,
     }
 }  # fmt: skip
-CRPO = {
-    "policy_update": {
-        "_target_": "safe_rl.algorithms.CRPOStep", **TRUST_REGION, "tolerance": 2.0
-    }
-}  # fmt: skip
-PCPO = {
-    "policy_update": {
-        "_target_": "safe_rl.algorithms.PCPOStep", **TRUST_REGION, "projection": "kl",
-        "rescale_violation": True,
-    }
-}  # fmt: skip
-C_TRPO = {
-    "policy_update": TRPO["policy_update"]
-    | {"_target_": "safe_rl.algorithms.CTRPOStep", "beta": 0.1, "hysteresis": 0.8}
-}
-# of the methods' own articles, within the setting that all share
-PROJECTED = {"_target_": "safe_rl.objectives.ProjectedMultiplier", "init": 0.0}
-CUP_UPDATE = PPO["policy_update"] | {
-    "_target_": "safe_rl.algorithms.CUPUpdate", "max_kl": 0.02, "gamma": 0.99, "lmbda": 0.97
-}  # fmt: skip
-PAPER = {
+NUMBERS = {
     "ppo": SHARED | PPO,
     "ppo_lagrangian": SHARED | PPO | COSTS | MULTIPLIER,
     "trpo": SHARED | TRPO,
     "trpo_lagrangian": SHARED | TRPO | COSTS | MULTIPLIER,
     "cpo": SHARED | CPO | COSTS,
-    "p3o": SHARED | PPO | COSTS,
-    "ipo": SHARED | PPO | COSTS,
-    "focops": SHARED | {"policy_update": PPO["policy_update"] | {"max_kl": 0.02}} | COSTS
-    | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
-    "rcpo": SHARED | PPO | COSTS | {"lagrangian": {**PROJECTED, "lr": 0.001, "highest": None}},
-    "crpo": SHARED | CRPO | COSTS,
-    "pcpo": SHARED | PCPO | COSTS,
-    "cup": SHARED | {"policy_update": CUP_UPDATE} | COSTS
-    | {"lagrangian": {**PROJECTED, "lr": 0.01, "highest": 2.0}},
-    "c_trpo": SHARED | C_TRPO | COSTS,
-}  # fmt: skip
+}
 LOSSES = {
     "ppo": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
     "ppo_lagrangian": {
@@ -188,22 +163,7 @@ LOSSES = {
     "trpo": {"_target_": "safe_rl.objectives.TRPOLoss"},
     "trpo_lagrangian": {"_target_": "safe_rl.objectives.TRPOLagrangianLoss"},
     "cpo": {"_target_": "safe_rl.objectives.CPOLoss"},
-    "p3o": {
-        "_target_": "safe_rl.objectives.P3OLoss", "kappa": 20.0, "clip_epsilon": 0.2
-    },
-    "ipo": {
-        "_target_": "safe_rl.objectives.IPOLoss", "kappa": 0.01, "max_weight": 3.0,
-        "clip_epsilon": 0.2,
-    },
-    "focops": {
-        "_target_": "safe_rl.objectives.FOCOPSLoss", "temperature": 1.5, "max_state_kl": 0.02
-    },
-    "rcpo": {"_target_": "safe_rl.objectives.RCPOLoss", "clip_epsilon": 0.2},
-    "crpo": {"_target_": "safe_rl.objectives.CPOLoss"},
-    "pcpo": {"_target_": "safe_rl.objectives.CPOLoss"},
-    "cup": {"_target_": "safe_rl.objectives.PPOLoss", "clip_epsilon": 0.2},
-    "c_trpo": {"_target_": "safe_rl.objectives.CPOLoss"},
-}  # fmt: skip
+}
 # per environment: steps in all, environments, steps per epoch
 SIZES = {
     "PointGoal1": (10_000_000, 30, 30_000),
@@ -220,35 +180,25 @@ ASIDE = {
 
 @pytest.mark.parametrize("env", SIZES)
 @pytest.mark.parametrize("algo", PAPER)
-def test_the_paper_preset_is_the_paper(env, algo):
-    config = compose_config("preset=paper", f"env={env}", f"algo={algo}")
+def test_the_numbers_of_the_paper(env, algo):
+    config = compose_config(f"algo=paper/{algo}", f"env={env}")
+    check_settings(config)
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     # a switch that is off, such as one to start from another run, is null
     found = {k: v for k, v in plain.items() if k not in ASIDE and v is not None}
     sizes = dict(zip(("frames", "num_envs", "frames_per_batch"), SIZES[env], strict=True))
-    assert found == PAPER[algo] | sizes | {"loss": {**LOSSES[algo], "entropy_coeff": 0.0}}
-
-
-def test_the_paper_has_no_algorithm_that_learns_from_memory():
-    others = set(ALGORITHMS) - set(PAPER)
-    assert all(find_algorithm(compose_config(f"algo={name}")) is OffPolicy for name in others)
-    # of what all share they have their own numbers
-    assert compose_config("algo=sac").frames_per_batch == 5_000
-    assert compose_config("algo=ppo").frames_per_batch == 20_000
+    assert found == NUMBERS[algo] | sizes | {"loss": {**LOSSES[algo], "entropy_coeff": 0.0}}
 
 
 def test_a_robot_of_ones_own_has_the_numbers_of_point():
-    config = compose_config("preset=paper", "env=PointMass", "env.robot_base=xmls/mine.xml")
+    config = compose_config("algo=paper/ppo", "env=PointMass", "env.robot_base=xmls/mine.xml")
     assert (config.frames, config.num_envs, config.frames_per_batch) == (10_000_000, 30, 30_000)
 
 
-def test_factors_on_the_command_line_replace_those_of_the_preset():
+def test_factors_on_the_command_line_replace_those_of_the_algorithm():
     assert compose_config().model.input_scale == {"accelerometer": 0.1, "gyro": 0.3}
-    assert compose_config("preset=paper").model.input_scale == {}
-    for preset in ("default", "paper"):
-        for written, factors in (("gyro: 1, x: 0.5", {"gyro": 1, "x": 0.5}), ("", {})):
-            config = compose_config(f"preset={preset}", f"model.input_scale={{{written}}}")
-            assert config.model.input_scale == factors
+    for written, factors in (("gyro: 1, x: 0.5", {"gyro": 1, "x": 0.5}), ("", {})):
+        assert compose_config(f"model.input_scale={{{written}}}").model.input_scale == factors
 
 
 def test_cost_limits_on_the_command_line_replace_the_default():
@@ -278,7 +228,7 @@ def test_the_compile_switch_reaches_both_updates():
 
 
 def test_hyper_parameters_have_one_home():
-    """Numbers that a preset decides are not defaults of the classes that use them."""
+    """Numbers of an algorithm's file are not defaults of the classes that use them."""
     config = compose_config("env=PointMass")
     del config.policy_update.num_passes
     with pytest.raises(Exception, match="num_passes"):

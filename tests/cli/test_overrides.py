@@ -11,6 +11,9 @@ RIGHT = [
     ["algo=cpo", "policy_update={target_kl: 0.02}", "++seed=3"],
     ["algo=sac", "policy_update.optimizer.lr=1e-3", "loss.gamma=0.9"],
     ["-m", "algo=sac,td3", "seed=0"],
+    ["algo=paper/cpo", "policy_update.target_kl=0.02"],
+    ["-m", "algo=ppo,trpo,cup", "preset=gpu"],
+    ["-m", "algo=sac,sac_lagrangian", "preset=hard_tasks"],
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
@@ -25,6 +28,8 @@ WRONG = {
     "transforms=[saut]": "no transforms 'saut'. Did you mean 'saute'",
     "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
     "env={name: CarGoal1}": "would train env=PointGoal1 under the name of .*write env=CarGoal1",
+    "preset=paper": "write algo=paper/cpo",
+    "preset=hard_tasks": "^preset=hard_tasks: algo=ppo_lagrangian has no 'memory'",
     "slate=SG7": "Unknown slate 'SG7'",
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
@@ -56,6 +61,26 @@ def test_an_algorithm_has_the_name_of_its_choice():
     """A merged mapping once trained PPO-Lagrangian as CPO."""
     (config,) = composed("algo={name: cpo}")
     assert config.algo.name == "ppo_lagrangian"
+
+
+@pytest.mark.parametrize(
+    ("algo", "argument", "words"),
+    [
+        ("sac", "preset=gpu", "^preset=gpu: algo=sac has no 'critic_update'"),
+        ("paper/cpo", "preset=gpu", "^preset=gpu: algo=cpo has no 'limits'"),
+        ("ppo", "lagrangian=pid", "^this algorithm has no 'lagrangian'"),
+        ("sac", "critic_update.num_passes=3", "^this algorithm has no 'critic_update'"),
+        ("cpo", "limits=default", "^algo=cpo has no 'limits'"),
+    ],
+)
+def test_what_only_other_algorithms_have_is_refused(algo, argument, words):
+    with pytest.raises(ValueError, match=words):
+        composed(f"algo={algo}", argument)
+
+
+def test_an_algorithm_without_limits_takes_none_from_a_preset():
+    (config,) = composed("algo=ppo", "preset=gpu")
+    assert "limits" not in config
 
 
 def test_a_risk_measure_is_refused_where_no_limit_is_kept():

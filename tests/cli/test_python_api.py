@@ -116,7 +116,7 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         before = GlobalHydra.instance().hydra
         for seed in (0, 1):
-            run = safe_rl.train(algo="ppo", frames=40, seed=seed, preset="default", **SMALL)
+            run = safe_rl.train(algo="ppo", frames=40, seed=seed, **SMALL)
             assert run.directory.match(f"runs/PointGoal1/ppo/*_seed{seed}")
         assert GlobalHydra.instance().hydra is before
         assert compose("config", overrides=["seed=7"]).seed == 7

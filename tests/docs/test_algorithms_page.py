@@ -70,19 +70,17 @@ def test_the_columns_are_those_of_an_off_policy_run(algo, tmp_path):
     assert columns_of_a_run(config, tmp_path) == documented
 
 
-@pytest.mark.parametrize("preset", ["default", "paper"])
-def test_the_numbers_of_the_presets(preset):
+@pytest.mark.parametrize("folder", ["", "paper/"])
+def test_the_numbers_of_the_paper_beside_the_defaults(folder):
     algorithms = ("ppo_lagrangian", "cpo")
-    configs = [
-        compose_config(f"preset={preset}", f"algo={algo}", "env=PointMass") for algo in algorithms
-    ]
+    configs = [compose_config(f"algo={folder}{algo}", "env=PointMass") for algo in algorithms]
     for key, default, paper, _ in rows("presets"):
-        value = OmegaConf.create(f"value: {default if preset == 'default' else paper}").value
+        value = OmegaConf.create(f"value: {paper if folder else default}").value
         assert value in [OmegaConf.select(config, key.strip("`")) for config in configs], key
 
 
 def test_costs_are_estimated_as_rewards_are_but_for_what_the_table_says():
-    for preset, own in (("default", []), ("paper", ["lmbda"])):
-        config = compose_config(f"preset={preset}", "algo=cpo", "env=PointMass")
+    for algo, own in (("cpo", []), ("paper/cpo", ["lmbda"])):
+        config = compose_config(f"algo={algo}", "env=PointMass")
         same = ("gamma", "value_target", *own)
         assert all(config.cost_advantage[key] == config.advantage[key] for key in same)

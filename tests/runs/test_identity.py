@@ -27,7 +27,7 @@ def as_saved(*overrides):
 
 @pytest.fixture(scope="module")
 def all_keys():
-    choices = ["preset=paper", "collector=ray", "collector=process"]
+    choices = ["algo=paper/cpo", "collector=ray", "collector=process"]
     choices += [f"algo={algorithm}" for algorithm in ALGORITHMS]
     choices += [f"logger={logger}" for logger in LOGGERS]
     keys = {key for one in choices for key in nodes(as_saved(one))}

@@ -52,7 +52,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
     [
         ["algo=sac_lagrangian"],
         ["algo=td3_lagrangian", "memory.n_steps=3", "lagrangian=adam"],
-        ["algo=sac_lagrangian", "memory.capacity=300", "limits/replay@limits=paper"],
+        ["algo=sac_lagrangian", "memory.capacity=300", "limits=null"],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
         ["algo=wcsac", "risk.window=9"],
         ["algo=cal", "lagrangian=pid"],
@@ -62,7 +62,7 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
 def test_it_resumes_with_its_replay_buffer_as_if_it_had_never_stopped(
     overrides, make_trainer, tmp_path
 ):
-    half = [] if "limits/replay@limits=paper" in overrides else ["limits.frames=1280"]
+    half = [] if "limits=null" in overrides else ["limits.frames=1280"]
     make = lambda name, *first: make_trainer(name, *first, *overrides)  # noqa: E731
     resumed = assert_resumes_exactly(make, tmp_path, "frames=640", *half)
     assert resumed.algorithm.lost_on_resume == ""
@@ -127,7 +127,7 @@ def test_a_delayed_policy_moves_every_other_step(make_trainer):
 
 def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
     """Not by what the critics say, which are trained on discounted costs."""
-    keys = ["lagrangian=projected", "limits/replay@limits=paper", "cost_limits={cost: 2}"]
+    keys = ["lagrangian=projected", "limits=null", "cost_limits={cost: 2}"]
     make_trainer("run", "algo=sac_lagrangian", *keys).run()
     table = read_table(tmp_path / "run" / "progress.csv")
     penalty = 0.0

@@ -56,7 +56,7 @@ def test_ppo_lagrangian_keeps_the_limits(tmp_path):
         *LEARNING,
         "algo=ppo_lagrangian",
         "cost_limits={cost_hazards: 1.0, cost_north: 1.0}",
-        "limits=paper",
+        "limits=null",
         "loss.cost_clipping=none",
         "lagrangian=adam",
         "lagrangian.init=0.3",
@@ -83,7 +83,7 @@ def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
     # episodes of 27 steps are open at the end of every batch of 40; a descent of the limit would
     # depend on the frames of a run
     make = lambda name, *half: point_mass_trainer(  # noqa: E731
-        tmp_path / name, "limits=paper", *half, num_steps=27
+        tmp_path / name, "limits=null", *half, num_steps=27
     )
     assert_resumes_exactly(make, tmp_path, "frames=640")
 
@@ -166,7 +166,7 @@ def test_nothing_is_best_while_a_limit_is_broken(tmp_path):
 
 
 def test_epochs_without_a_finished_episode(tmp_path):
-    _, table = train(tmp_path, "limits=paper", "staggered_starts=null", num_steps=100)
+    _, table = train(tmp_path, "limits=null", "staggered_starts=null", num_steps=100)
     # 40 steps per environment and epoch, episodes of 100 steps
     known = [not math.isnan(value) for value in table["episode_cost"]]
     assert known == [False, False, True, False, True, False, False, True]
@@ -221,11 +221,21 @@ loss: {_target_: test_training.PenalisedLoss, penalty: 3.0}
 
 OWN_UPDATE = """
 # @package _global_
-defaults:
-  - /cost_advantage: ${preset}
 algo: {name: mine, constrained: true}
 loss: {_target_: safe_rl.objectives.PPOLoss, clip_epsilon: 0.2, entropy_coeff: 0.0}
 policy_update: {_target_: test_training.ReportingUpdate}
+advantage: {_target_: safe_rl.objectives.VectorGAE, gamma: 0.99, lmbda: 0.95}
+cost_advantage: {_target_: safe_rl.objectives.CostGAE, gamma: 0.99, lmbda: 0.9}
+critic_update:
+  _target_: safe_rl.algorithms.MinibatchUpdate
+  optimizer: {_target_: torch.optim.Adam, _partial_: true, lr: 1.0e-3}
+  num_passes: 10
+  minibatch_size: 40
+model: {hidden_sizes: [16], initial_log_std: -0.5, input_scale: {}, head: auto, normalise: null}
+frames: 1280
+num_envs: 4
+frames_per_batch: 160
+staggered_starts: null
 """
 
 
@@ -286,7 +296,7 @@ FOREIGN = "test_training.ForeignUpdate"
         ),
         (
             OWN_UPDATE.replace("PPOLoss", "PPOLagrangianLoss"),
-            r"PPOLagrangianLoss needs a multiplier, .* add '- /lagrangian: \$\{preset\}' to the",
+            r"PPOLagrangianLoss needs a multiplier, .* add '- /lagrangian: pi' to the",
         ),
     ],
 )

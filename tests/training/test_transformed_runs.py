@@ -53,11 +53,11 @@ def test_an_interrupted_run_resumes_exactly(tmp_path, transforms):
 
 
 def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_path):
-    counts = ["frames_per_batch=160", "exploration.random_steps=320", "replay.num_envs=4"]
+    counts = ["frames_per_batch=160", "exploration.random_steps=320", "num_envs=4"]
     counts += ["policy_update.updates_per_step=0.1", "memory.batch_size=8", "memory.n_steps=1"]
     counts += ["limits.free_steps=160", "limits.descent_steps=160", "cost_limits={cost: 1}"]
     counts += ["frames=640"]
-    options = ["algo=sac_lagrangian", "preset=default", "transforms=[action_repeat]", *counts]
+    options = ["algo=sac_lagrangian", "transforms=[action_repeat]", *counts]
     trainer = make_trainer(tmp_path, *options, minibatch_size=None)
     starts = trainer._env.get_state()["step_count"][:, 0].tolist()
     assert starts == [0, 4, 8, 12]  # of 20 steps: 0, 5, 10, 15 rounded down to decisions
