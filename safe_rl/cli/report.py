@@ -6,31 +6,51 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from annotated_types import Interval
+from pydantic import PositiveInt
+
+from safe_rl.checks import rule
 from safe_rl.cli.options import run_command
 from safe_rl.cli.user_code import import_modules
 from safe_rl.envs import SUITE, env_node, resolve
 from safe_rl.evaluation.settings import option
 from safe_rl.files import check_place
-from safe_rl.reporting import Report, build_report, write_report
+from safe_rl.reporting import Look, Report, build_report, write_report
 from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
 from safe_rl.scores.benchmark import SEEDS, Suite
 
 FORMATS = ("png", "svg", "pdf")
+_FORMATS = rule(
+    lambda text: set(_listed(text)) <= set(FORMATS), f"one or more of {', '.join(FORMATS)}"
+)
+
+
+def _listed(text: str | None) -> list[str]:
+    """Parts of a text that commas separate."""
+    return list(filter(None, map(str.strip, (text or "").split(","))))
 
 
 @dataclass
 class ReportOptions:
-    """Options of ``python -m safe_rl.report``; their help texts describe them."""
+    """Options of ``safe-rl report``; their help texts describe them."""
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
-    seeds: int = option(len(SEEDS), "finished runs per environment that a slate needs")
+    seeds: PositiveInt = option(len(SEEDS), "finished runs per environment that a slate needs")
     algos: str | None = option(None, "algorithms to report, such as cpo,ppo_lagrangian; null: all")
-    formats: str = option("png", "of the pictures, such as png,svg,pdf")
+    baselines: str | None = option(
+        None, "other runs to put beside these: archives or folders, such as results/held_out"
+    )
     unfinished: bool = option(False, "include unfinished runs in scores")
     archive: str | None = option(None, "campaign archive to add the runs to; null: none")
     title: str | None = option(None, "heading; null: the folder's name")
+    formats: Annotated[str, _FORMATS] = option("png", "of the pictures, such as png,svg,pdf")
+    width: Annotated[float, Interval(ge=2, le=40)] = option(12.0, "of the pictures [inch]")
+    panels: bool = option(False, "write every panel of a picture to a file of its own, too")
+    labels: dict[str, str] = option(dict, "names to show, such as '{cpo: CPO (ours)}'")
+    columns: str | None = option(None, "columns of tables.tex, such as algorithm,J_r,J_c")
 
 
 def suite() -> Suite:
@@ -48,26 +68,28 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         ValueError: If an option cannot have its value; if RUNS_DIR/report is a link, because
             another person could have chosen what it overwrites.
     """
-    if options.seeds < 1:
-        raise ValueError(f"seeds={options.seeds}: a slate takes at least one run per environment.")
-    formats = [form.strip() for form in options.formats.split(",")]
-    for form in formats:
-        if form not in FORMATS:
-            raise ValueError(f"formats={form}: pictures are written as {', '.join(FORMATS)}.")
     out = root / "report" if options.out is None else Path(options.out).expanduser()
     if options.out is None and out.is_symlink():
         raise ValueError(f"{out} is a link: remove it, or give out=FOLDER.")
     if root.is_dir():
         check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
-    algorithms = list(filter(None, map(str.strip, (options.algos or "").split(","))))
+    look = Look(
+        formats=_listed(options.formats),
+        width=options.width,
+        panels=options.panels,
+        labels=options.labels,
+        columns=_listed(options.columns),
+    )
     result = build_report(
         root,
         suite(),
         seeds_needed=options.seeds,
         unfinished=options.unfinished,
-        algorithms=algorithms,
+        algorithms=_listed(options.algos),
+        baselines=[Path(place).expanduser() for place in _listed(options.baselines)],
+        look=look,
     )
-    page = write_report(result, out, options.title or root.resolve().name, formats)
+    page = write_report(result, out, options.title or root.resolve().name, look)
     if options.archive is not None:
         archive_runs(result.runs, root, Path(options.archive).expanduser())
     return result, page

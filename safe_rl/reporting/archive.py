@@ -1,4 +1,4 @@
-"""Find the runs below a folder, in folders of their own and in archives; write archives.
+"""Runs as a report reads them: in folders of their own and in archives; archives are written here.
 
 An archive has two files. ``runs.json.gz`` has a line per run, with its configuration and notes.
 ``rows.csv.gz`` has the epochs of all runs, with the run in the first column. Files that cannot be
@@ -10,24 +10,133 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from safe_rl.extras import import_extra
 from safe_rl.files import read_config, read_json, read_yaml, replacing
-from safe_rl.reporting.recorded import Run, read_certificate, read_code, read_evaluation, select
-from safe_rl.reporting.tables import clean
+from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
+from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import differences, role_of
-from safe_rl.runs.run import Run as RunFolder
-from safe_rl.runs.run import find_runs as find_folders
+from safe_rl.runs.outcome import judges_another_measure
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
+
+
+class Run(folders.Run):
+    """A run of a report.
+
+    Args:
+        directory: Its folder; for an archived run, its name below the archive.
+        settings: Its configuration, resolved.
+        table: Columns of its table; a row per epoch, NaN where there is no number.
+        notes: ``overrides``, ``certificate``, ``code`` and so on, as in its files.
+
+    Attributes:
+        takes_part: Whether it counts as finished before it has reached its end.
+        source: Name of the baselines that it belongs to; "" for a run of the report itself.
+    """
+
+    takes_part: bool = False
+    source: str = ""
+
+    def __init__(
+        self,
+        directory: Path,
+        settings: Mapping[str, Any],
+        table: Mapping[str, list[float]],
+        notes: Mapping[str, Any],
+    ) -> None:
+        own = {name: notes.get(name) for name in ("certificate", "evaluations", "code")}
+        super().__init__(directory, settings=settings, table=table, **own)
+        self.notes = notes
+        said = notes.get("overrides")
+        self.overrides = list(map(clean, said)) if isinstance(said, list) else None
+
+    def check(self) -> None:
+        """Refuse a run that lacks what a report needs.
+
+        Raises:
+            ValueError: If the configuration or the table lacks something.
+            Exception: Of any type, if notes are not as a run writes them.
+        """
+        given = {**self.settings, "cost_limits": self.settings.get("cost_limits") or {}}
+        wrong = folders.unusable_keys(given)
+        wrong += [] if "frames" in given else ["frames"]
+        if wrong:
+            raise ValueError(
+                f"config.yaml is not that of a run: it lacks a usable {', '.join(wrong)}"
+            )
+        if not self.table.get("steps"):
+            raise ValueError("it has not finished an epoch")
+        needed = ["episode_return", "time_total"]
+        needed += [name for key in self.cost_limits for name in (f"episode_{key}", f"{key}_rate")]
+        if missing := [name for name in needed if name not in self.table]:
+            raise ValueError(f"progress.csv has no column {missing[0]}")
+        steps = np.array([0.0, *self.table["steps"]])
+        if not (np.isfinite(steps).all() and (np.diff(steps) > 0).all() and self.hours > 0):
+            raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
+        for name in ("repeating", "evaluation_records", "certificate_record", "code_text"):
+            getattr(self, name)
+
+    @property
+    def length(self) -> int:
+        """The configured number of environment steps; for an unfinished run, those so far."""
+        configured = self.settings["frames"]
+        return int(configured) if 0 < configured <= self.steps else self.steps
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it counts as finished."""
+        return self.takes_part or super().is_finished
+
+    @property
+    def repeating(self) -> str | None:
+        """The command that repeats it, or None if its overrides are not recorded."""
+        if self.overrides is None:
+            return None
+        words = [f"--config-dir={clean(path)}" for path in self.notes.get("config_dirs", ())]
+        if isinstance(self.notes.get("frames_before"), int):  # it was continued for longer
+            words += [word for word in self.overrides if not word.startswith("frames=")]
+            words += [f"frames={self.settings['frames']}"]
+        else:
+            words += self.overrides
+        return shlex.join(["python", "train.py", *words])
+
+    @cached_property
+    def evaluation_records(self) -> list[dict[str, Any]]:
+        """Its evaluations, each as a record, see `read_evaluation`."""
+        return [read_evaluation(found) for found in self.notes.get("evaluations", ())]
+
+    @cached_property
+    def certificate_record(self) -> dict[str, Any] | None:
+        """Its certificate as a record, see `read_certificate`, or None."""
+        return read_certificate(self.notes["certificate"]) if "certificate" in self.notes else None
+
+    @cached_property
+    def code_text(self) -> str | None:
+        """The version and commit of its code, see `read_code`, or None."""
+        return read_code(self.notes["code"]) if "code" in self.notes else None
+
+    def limits_another_measure(self, key: str) -> bool:
+        """Whether the limit of a cost is on another measure than the mean cost of an episode."""
+        return judges_another_measure(self.table, key, self.cost_limits[key])
+
+
+def select(node: Any, *keys: str) -> Any:
+    """The value at a path of keys in nested mappings, or None."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
@@ -50,14 +159,15 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for path in paths_below(root, RUNS):
         with _noted(path, skipped):
             found += read_archive(path.parent).values()
-    for folder in find_folders(root):
+    for folder in folders.find_runs(root):
         with _noted(folder.directory, skipped):
             found.append(_read_run(folder, skipped))
     runs = []
     for run in found:
         with _noted(run.directory, skipped):
             run.check()
-            runs.append(replace(run, takes_part=unfinished))
+            run.takes_part = unfinished
+            runs.append(run)
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())
         raise FileNotFoundError(
@@ -78,7 +188,7 @@ def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
         skipped[path] = clean(reason)
 
 
-def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
+def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
     """Read a run from its folder; notes that cannot be read are left out."""
 
     def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
@@ -90,7 +200,7 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
                 return content
         return None
 
-    config = read_config(folder.config_file)
+    settings = read_config(folder.config_file)
     if not folder.table_file.exists():
         raise ValueError("it has not begun: no progress.csv")
     table = read_table(folder.table_file)
@@ -103,7 +213,7 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
         "overrides": read(folder.overrides_file),
         # relative to the folder where the run was started, as a user would type them
         "config_dirs": [os.path.relpath(p, start) if start else p for p in directories] or None,
-        "frames_before": before if before != config.get("frames") else None,
+        "frames_before": before if before != settings.get("frames") else None,
         "certificate": read(folder.certificate_file, read_certificate),
         "code": read(folder.code_file, read_code),
         "evaluations": [
@@ -114,7 +224,7 @@ def _read_run(folder: RunFolder, skipped: dict[Path, str]) -> Run:
         or None,
     }
     kept = {name: value for name, value in notes.items() if value is not None}
-    return Run(folder.directory, config, table, kept)
+    return Run(folder.directory, settings, table, kept)
 
 
 def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
@@ -131,7 +241,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     kept = read_archive(archive) if (archive / RUNS).exists() else {}
     names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
     for name in kept.keys() & names:
-        differing = differences(kept[name].config, names[name].config)
+        differing = differences(kept[name].settings, names[name].settings)
         # what `resume=` may change makes no other run
         if found := [key for key in differing if not role_of(key).may_change]:
             raise ValueError(
@@ -152,7 +262,7 @@ def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
     pandas = import_extra("pandas", "report")
     runs = dict(sorted(runs.items()))
     folder.mkdir(parents=True, exist_ok=True)
-    entries = {name: {"config": run.config, **run.notes} for name, run in runs.items()}
+    entries = {name: {"config": run.settings, **run.notes} for name, run in runs.items()}
     lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
     tables = {name: pandas.DataFrame(run.table) for name, run in runs.items()}
     rows = pandas.concat(tables, names=["run", "row"]).reset_index("run").convert_dtypes()

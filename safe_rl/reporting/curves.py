@@ -11,13 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.figures import LIMIT_STYLE, WIDTH, Style, add_legend, literal, set_grid
-from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import final_width
-from safe_rl.scores.comparisons import bootstrap
+from safe_rl.scores.comparisons import t_interval
 
 _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
 _NUM_MARKERS = 6  # of a curve
@@ -62,23 +62,25 @@ def average(
     grid = np.linspace(start, stop, min(longest, _NUM_POINTS)) if stop > start else np.array([stop])
     heights = np.stack([np.interp(grid, steps, values) for steps, values in series], -1)
     nothing = np.full(grid.shape, np.nan)
-    ends = bootstrap([heights], np.mean) if with_band else (nothing, nothing)
+    ends = t_interval(heights) if with_band else (nothing, nothing)
     return Average(grid, heights.mean(-1), *ends)
 
 
-def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str, Style]) -> Figure:
+def draw_learning_curves(
+    experiments: Sequence[Experiment], styles: Mapping[str, Style], width: float = WIDTH
+) -> Figure:
     """Draw return, episode cost and cost rate over steps, a row per environment.
 
-    Lines are means over seeds, bands their 95 % intervals. Return and episode cost are moving means
-    over as many epochs as final figures. Limits d are dashed, and so is d / T_ep in the panel of
-    the cost rate. Each unfinished run is a dotted line of its own. An environment has a row for
+    Lines are means over seeds, bands their 95 % t intervals. Return and episode cost are moving
+    means over as many epochs as final figures. Limits d are dashed, and so is d / T_ep in the panel
+    of the cost rate. Each unfinished run is a dotted line of its own. An environment has a row for
     each number of steps and each cost with a limit.
     """
     groups: dict[tuple[str, int], list[Experiment]] = {}
     for e in experiments:
         groups.setdefault((e.environment, e.planned_steps), []).append(e)
     rows = [(*group, key) for group, own in groups.items() for key in drawn_keys(own)]
-    figure = Figure(figsize=(WIDTH, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
+    figure = Figure(figsize=(width, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
     panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
     several = len({name for name, _ in groups}) < len(groups)
     for (environment, steps, key), axes in zip(rows, panels, strict=True):
@@ -101,7 +103,7 @@ def draw_learning_curves(experiments: Sequence[Experiment], styles: Mapping[str,
 
 
 def draw_small_multiples(
-    experiments: Sequence[Experiment], key: str, styles: Mapping[str, Style]
+    experiments: Sequence[Experiment], key: str, styles: Mapping[str, Style], width: float = WIDTH
 ) -> Figure:
     """Draw return, episode cost and cost rate of many algorithms, a column of panels for each.
 
@@ -112,12 +114,13 @@ def draw_small_multiples(
     for experiment in experiments:
         columns.setdefault(experiment.base, []).append(experiment)
     means = {e.label: _curves(e.finished, key, with_band=False) for e in experiments}
-    width = min(_MULTIPLES, -(-len(columns) // -(-len(columns) // _MULTIPLES)))
-    bands = -(-len(columns) // width)
-    figure = Figure(figsize=(WIDTH, 0.3 + 4.2 * bands), layout="constrained")
-    panels = figure.subplots(3 * bands, width, squeeze=False)
+    most = max(1, round(_MULTIPLES * width / WIDTH))
+    together = min(most, -(-len(columns) // -(-len(columns) // most)))
+    bands = -(-len(columns) // together)
+    figure = Figure(figsize=(width, 0.3 + 4.2 * bands), layout="constrained")
+    panels = figure.subplots(3 * bands, together, squeeze=False)
     for number, own in enumerate(columns.values()):
-        band, column = divmod(number, width)
+        band, column = divmod(number, together)
         axes = list(panels[3 * band : 3 * band + 3, column])
         others = [means[label] for label in means if label not in {e.label for e in own}]
         for axis, *curves in zip(axes, *others, strict=True):
@@ -173,9 +176,36 @@ def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
 
 
 def _curves(runs: Sequence[Run], key: str, *, with_band: bool = True) -> list[Average | None]:
-    """Return, episode cost and cost rate of runs."""
-    columns = (("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False))
-    return [average(runs, name, smooth=s, with_band=with_band) for name, s in columns]
+    """Return, episode cost and cost rate; without an episode the first two per 1,000 steps."""
+    columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
+    if are_short(runs):
+        columns[:2] = [("reward_rate", False), (f"{key}_rate", False)]
+    found = [average(runs, name, smooth=s, with_band=with_band) for name, s in columns]
+    if are_short(runs):
+        found[:2] = [c and Average(c.steps, *(1000 * v for v in c[1:])) for c in found[:2]]
+    return found
+
+
+def are_short(runs: Sequence[Run]) -> bool:
+    """Whether no episode of these runs has ended."""
+    return not any(run.column("episode_return").size for run in runs)
+
+
+def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
+    """All curves of the pictures as a long table: a row for every point of every quantity."""
+    return [
+        {
+            **{"environment": e.environment, "algorithm": e.algorithm, "cost": key},
+            **{"quantity": name, "per_1000_steps": are_short(runs), "seeds": len(runs)},
+            **dict(zip(Average._fields, map(float, point), strict=True)),
+        }
+        for e in experiments
+        for runs in [e.finished or e.runs]
+        for key in drawn_keys([e])
+        for name, curve in zip(("return", "cost", "rate"), _curves(runs, key), strict=True)
+        if curve is not None
+        for point in zip(*curve, strict=True)
+    ]
 
 
 def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
@@ -188,6 +218,7 @@ def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], styl
     unfinished = [[run] for run in experiment.runs if not run.is_finished]
     looks += [(runs, f"{name} (unfinished)", ":", 1.2) for runs in unfinished]
     for runs, label, line, width in looks:
+        label += " (per 1,000 steps)" if are_short(runs) else ""
         for axis, curve in zip(axes, _curves(runs, key), strict=True):
             if curve is None:
                 continue

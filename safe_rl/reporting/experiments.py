@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from safe_rl.files import CONF
-from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.archive import Run
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
@@ -20,7 +20,7 @@ PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 Settings = Mapping[str, Hashable]
 
 # settings that names contain wherever they differ, even if no command line sets them
-_ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk")
+_ALWAYS_NAMED = ("preset", "init_from", "frames", "cost_limits", "risk", "source")
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Experiment:
     @property
     def limits(self) -> dict[str, float]:
         """Cost key -> d, undiscounted cost per episode."""
-        return self.runs[0].limits
+        return self.runs[0].cost_limits
 
     @property
     def has_published_limit(self) -> bool:
@@ -89,7 +89,7 @@ class Experiment:
     @property
     def is_continued(self) -> bool:
         """Whether a run of it started from another run's networks."""
-        return any(run.config.get("init_from") is not None for run in self.runs)
+        return any(run.settings.get("init_from") is not None for run in self.runs)
 
     @property
     def finished(self) -> tuple[Run, ...]:
@@ -104,7 +104,7 @@ class Experiment:
     @property
     def planned_steps(self) -> int:
         """Environment steps after which its runs end."""
-        return int(self.runs[0].config["frames"]) or max(run.steps for run in self.runs)
+        return int(self.runs[0].settings["frames"]) or max(run.steps for run in self.runs)
 
 
 def cost_keys_of(experiments: Sequence[Experiment]) -> list[str]:
@@ -113,8 +113,15 @@ def cost_keys_of(experiments: Sequence[Experiment]) -> list[str]:
     return list(dict.fromkeys([*keys, *(key for e in experiments for key in e.limits)]))
 
 
-def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dict[Path, str]]:
+def group_runs(
+    runs: Sequence[Run], suite: Suite, labels: Mapping[str, str] | None = None
+) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
+
+    Args:
+        runs: The runs.
+        suite: The benchmark.
+        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
 
     Returns:
         Experiments, and folder -> the reason why a run is left out.
@@ -125,8 +132,8 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
     skipped: dict[Path, str] = {}
     # of several runs with one seed, the longest is kept; among equal ones the last by name
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
-        environment, title = environments[run.directory], clean(title_of(run.algorithm), 80)
-        benchmark = suite.name_of(run.config["env"])
+        environment, title = environments[run.directory], _title(run, labels or {})
+        benchmark = suite.name_of(run.settings["env"])
         own = Experiment(environment, title, settings[run.directory], benchmark, (run,))
         cell = cells[environment, own.algorithm]
         if run.seed in cell:
@@ -136,6 +143,10 @@ def group_runs(runs: Sequence[Run], suite: Suite) -> tuple[list[Experiment], dic
     ordered = [[cell[seed] for seed in sorted(cell)] for cell in cells.values()]
     experiments = [replace(own[0], runs=tuple(e.runs[0] for e in own)) for own in ordered]
     return sorted(experiments, key=_order), skipped
+
+
+def _title(run: Run, labels: Mapping[str, str]) -> str:
+    return clean(labels.get(run.algorithm) or title_of(run.algorithm), 80)
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:
@@ -152,11 +163,11 @@ def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
     """
     alike: dict[str, list[Settings]] = defaultdict(list)
     for run in runs:
-        alike[str(run.config["env"].get("name", "environment"))].append(flatten(run.config["env"]))
+        alike[run.environment].append(flatten(run.settings["env"]))
     titles = {}
     for run in runs:
-        node = run.config["env"]
-        name = str(node.get("name", "environment"))
+        node = run.settings["env"]
+        name = run.environment
         changes = suite.changes(node)
         if changes is None:
             settings, keys = flatten(node), distinguishing_keys([alike[name]])
@@ -222,11 +233,12 @@ def title_of(algorithm: str) -> str:
 
 def _settings(run: Run) -> dict[str, Hashable]:
     """The settings that may distinguish a run's algorithm from others of the same name."""
-    frames, settings = run.config["frames"], experiment_of(run.config)
+    frames, settings = run.settings["frames"], experiment_of(run.settings)
     # some keys only repeat the length of the run
     repeated = {key for key, v in settings.items() if v == frames and role_of(key) is Role.LENGTH}
     left_out = repeated - {"frames"} | {key for key in settings if key.startswith("env.")}
-    return {key: value for key, value in settings.items() if key not in left_out}
+    kept = {key: value for key, value in settings.items() if key not in left_out}
+    return {**kept, "source": run.source or None}
 
 
 def distinguishing_keys(cells: Sequence[Sequence[Settings]]) -> list[str]:
@@ -262,6 +274,8 @@ def _in_brackets(settings: Settings) -> str:
         shown = clean(_as_override(value))
         if key == "frames" and isinstance(value, int | float):
             texts.append(f"{short_number(value)} steps")
+        elif key == "source":
+            texts.append(shown)
         elif key.startswith("cost_limits."):
             texts.append(f"{clean(key.removeprefix('cost_limits.'))} ≤ {shown}")
         else:

@@ -101,10 +101,11 @@ def add_legend(figure: Figure, axes: Iterable[Axes]) -> None:
     handles = {fill(label, _LONGEST_LABEL, break_on_hyphens=False): h for h, label in pairs}
     if not handles:
         return
+    letters = int(_LEGEND * figure.get_figwidth() / WIDTH)
     longest = max(len(line) for label in handles for line in label.splitlines())
     legend = figure.legend(
         handles.values(), handles, loc="outside lower center", frameon=False, handlelength=5.0,
-        ncols=max(1, min(6, len(handles), _LEGEND // (longest + 10))),
+        ncols=max(1, min(6, len(handles), letters // (longest + 10))),
     )  # fmt: skip
     size = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
     figure.set_figheight(figure.get_figheight() + size.height / figure.dpi)
@@ -128,16 +129,18 @@ def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
     return {f"{e}, {n} steps": own for (e, n), own in groups.items() if len(own) > 1}
 
 
-def draw_fronts(groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style]) -> Figure:
+def draw_fronts(
+    groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style], width: float = WIDTH
+) -> Figure:
     """Draw final returns against final costs, a panel per group of :func:`compared`.
 
     A point is an experiment, with the standard deviations over its seeds. A line in an algorithm's
     colour joins its experiments under several limits; the limits are written beside the points.
     The grey line is the Pareto front.
     """
-    columns = min(3, len(groups))
+    columns = min(max(1, round(3 * width / WIDTH)), len(groups))
     rows = -(-len(groups) // columns)
-    figure = Figure(figsize=(WIDTH, 3.3 * rows + 0.2), layout="constrained")
+    figure = Figure(figsize=(width, 3.3 * rows + 0.2), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     for number, (axis, (title, own)) in enumerate(zip(panels, groups.items(), strict=False)):
         _draw_front(axis, own, styles)
@@ -227,3 +230,21 @@ def _draw_values(
     axis.set_xlim(-0.6, len(values) - 0.4)
     set_grid(axis)
     axis.grid(visible=False, axis="x")
+
+
+def save_panels(figure: Figure, path: Path, formats: Iterable[str]) -> None:
+    """Write every panel of a figure to a file of its own, and the legend, if it has one.
+
+    Args:
+        figure: The figure.
+        path: Stem of the files: ``curves`` becomes ``curves_1.pdf``, ``curves_legend.pdf``.
+        formats: Suffixes of the files.
+    """
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    parts: dict[str, Any] = {f"{n}": axis for n, axis in enumerate(figure.axes, 1) if axis.axison}
+    parts |= dict(zip(["legend"], figure.legends, strict=False))
+    for name, part in parts.items():
+        box = part.get_tightbbox(renderer).transformed(figure.dpi_scale_trans.inverted())
+        for form in formats:
+            save_figure(figure, path.with_name(f"{path.name}_{name}.{form}"), box.padded(0.04))

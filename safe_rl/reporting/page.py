@@ -5,8 +5,8 @@ from __future__ import annotations
 import base64
 import datetime
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from itertools import chain, count, groupby, starmap
@@ -18,11 +18,15 @@ from matplotlib.figure import Figure
 
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
-from safe_rl.reporting import figures, inventory, scoring
-from safe_rl.reporting.archive import find_runs
-from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples, drawn_keys
+from safe_rl.reporting import figures, scoring, slates
+from safe_rl.reporting.archive import Run, find_runs
+from safe_rl.reporting.curves import (
+    curve_rows,
+    draw_learning_curves,
+    draw_small_multiples,
+    drawn_keys,
+)
 from safe_rl.reporting.experiments import Experiment, group_runs
-from safe_rl.reporting.recorded import Run
 from safe_rl.reporting.tables import Table, clean, short_number
 from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import Suite
@@ -31,6 +35,25 @@ _MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed 
 _MOST_CURVES = 6  # in one panel
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a report is written.
+
+    Attributes:
+        formats: Formats of the pictures: png, svg, pdf. PNG is always written, for the page.
+        width: Width of the pictures [inch].
+        panels: Whether every panel of a picture has a file of its own, too.
+        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
+        columns: Columns of the tables in LaTeX, such as ``algorithm`` and ``J_c``; empty: all.
+    """
+
+    formats: Sequence[str] = ("png",)
+    width: float = figures.WIDTH
+    panels: bool = False
+    labels: Mapping[str, str] = field(default_factory=dict)
+    columns: Sequence[str] = ()
 
 
 class Drawing(NamedTuple):
@@ -70,8 +93,9 @@ class Report:
 
     @property
     def runs(self) -> list[Run]:
-        """All runs of the report."""
-        return [run for experiment in self.experiments for run in experiment.runs]
+        """All runs of the report, without baselines."""
+        runs = [run for experiment in self.experiments for run in experiment.runs]
+        return [run for run in runs if not run.source]
 
 
 def build_report(
@@ -81,6 +105,8 @@ def build_report(
     seeds_needed: int,
     unfinished: bool,
     algorithms: Sequence[str] = (),
+    baselines: Sequence[Path] = (),
+    look: Look = Look(),  # noqa: B008, it is frozen
 ) -> Report:
     """Find the runs below a folder, and make the sections of a report.
 
@@ -90,6 +116,9 @@ def build_report(
         seeds_needed: Finished runs per environment that a slate needs.
         unfinished: Whether unfinished runs count as finished ones.
         algorithms: Names in ``conf/algo`` of the algorithms to report; empty: all.
+        baselines: Folders or archives of other runs, which are put beside these where they have the
+            same environments; they keep the name of their folder.
+        look: How it is written.
 
     Raises:
         FileNotFoundError: If there is no run.
@@ -101,23 +130,28 @@ def build_report(
         if name not in known:
             raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
-    experiments, repeated = group_runs(chosen, suite)
+    chosen += _baselines(baselines, {run.environment for run in chosen})
+    experiments, repeated = group_runs(chosen, suite, look.labels)
     skipped |= repeated
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [scoring.final_table(group) for group in groups]
-    slates = scoring.complete_slates(experiments, seeds_needed)
+    complete = slates.complete_slates(experiments, seeds_needed)
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
         ("final", "Final scores", finals),
         ("learning", "What learning cost", list(filter(None, map(scoring.learning_table, groups)))),
-        ("curves", "Learning curves", _curves(experiments, styles)),
-        ("fronts", "Return against cost", _fronts(groups, finals, styles)),
-        ("normalised", "Normalised scores", list(starmap(scoring.slate_table, slates))),
-        ("certificates", "Certificates", [inventory.certificate_table(experiments)]),
-        ("evaluations", "Evaluations", [inventory.evaluation_table(experiments)]),
-        ("runs", "Runs", [inventory.run_table(experiments), left_out]),
+        ("curves", "Learning curves", _curves(experiments, styles, look.width)),
+        ("fronts", "Return against cost", _fronts(groups, finals, styles, look.width)),
+        (
+            "normalised",
+            "Normalised scores",
+            [*starmap(slates.slate_table, complete), slates.paper_table(experiments)],
+        ),
+        ("certificates", "Certificates", [scoring.certificate_table(experiments)]),
+        ("evaluations", "Evaluations", [scoring.evaluation_table(experiments)]),
+        ("runs", "Runs", [scoring.run_table(experiments), left_out]),
     ]
     # tables without rows are left out
     sections = [
@@ -127,22 +161,33 @@ def build_report(
     return Report(experiments, [s for s in sections if s.blocks], skipped)
 
 
+def _baselines(places: Sequence[Path], environments: Collection[str]) -> list[Run]:
+    """Finished runs of other folders in some environments, with the names of their folders."""
+    found = []
+    for place in places:
+        for run in find_runs(place)[0]:
+            if run.environment in environments and run.is_finished:
+                run.source = clean(place.resolve().name, 40)
+                found.append(run)
+    return found
+
+
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
     return [list(own) for _, own in groupby(experiments, key=lambda e: e.environment)]
 
 
 def _fronts(
-    groups: Sequence[Sequence[Experiment]], finals: Sequence[Table], styles: Styles
+    groups: Sequence[Sequence[Experiment]], finals: Sequence[Table], styles: Styles, width: float
 ) -> list[Drawing]:
     panels = figures.compared(zip(chain(*groups), chain(*(t.records for t in finals)), strict=True))
     if not panels:
         return []
     texts = [f"{what}: {', '.join(e.algorithm for e, _ in own)}" for what, own in panels.items()]
     says = f"Final return against final episode cost. {'; '.join(texts)}"
-    return [Drawing("fronts", "", figures.draw_fronts(panels, styles), says)]
+    return [Drawing("fronts", "", figures.draw_fronts(panels, styles, width), says)]
 
 
-def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
+def _curves(experiments: Sequence[Experiment], styles: Styles, width: float) -> list[Drawing]:
     """A picture of small multiples for each group of many curves; the others as rows."""
     what = "Return, episode cost and cost rate"
     rows, drawings = [], []
@@ -155,26 +200,28 @@ def _curves(experiments: Sequence[Experiment], styles: Styles) -> list[Drawing]:
             for key in drawn_keys(own):
                 title = f"{group[0].environment}, {short_number(steps)} steps"
                 title += "" if key == "cost" else f", {clean(key, 40)}"
-                figure = draw_small_multiples(own, key, styles)
+                figure = draw_small_multiples(own, key, styles, width)
                 says = f"{what}, a column per algorithm: {title}"
                 drawings.append(Drawing(f"curves_{title}", title, figure, says))
     for shown in (rows[n : n + _MOST_ROWS] for n in range(0, len(rows), _MOST_ROWS)):
         names = ", ".join(dict.fromkeys(own[0].environment for own in shown))
-        figure = draw_learning_curves([e for own in shown for e in own], styles)
+        figure = draw_learning_curves([e for own in shown for e in own], styles, width)
         says = f"{what} over environment steps: {names}"
         drawings.append(Drawing("curves", "", figure, says))
     return drawings
 
 
-def write_report(report: Report, out: Path, title: str, formats: Sequence[str] = ("png",)) -> Path:
+def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> Path:  # noqa: B008
     """Write a report into a folder: a page, pictures, tables as CSV and all of them in LaTeX.
+
+    ``curves.csv`` has the points of all learning curves, a row for each.
 
     Args:
         report: The content.
         out: The folder; it is made if it does not exist, and files of an earlier report are
             replaced.
         title: Heading of the page.
-        formats: Formats of the pictures: png, svg, pdf. PNG is always written, for the page.
+        look: How it is written.
 
     Returns:
         Path of the page, ``report.html``.
@@ -186,7 +233,9 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
     out.mkdir(parents=True, exist_ok=True)
     place = _places(out)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
-    replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
+    replace_text(out / "tables.tex", "\n".join(table.latex(look.columns) for table in tables))
+    curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
+    curves.write_csv(out / "curves.csv")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -200,7 +249,7 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
         date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         facts=_facts(report),
         texts=_TEXTS,
-        sections=[(s, [(b, _write(b, place, formats)) for b in s.blocks]) for s in report.sections],
+        sections=[(s, [(b, _write(b, place, look)) for b in s.blocks]) for s in report.sections],
     )
     replace_text(out / "report.html", text)
     return out / "report.html"
@@ -219,15 +268,17 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _write(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> str:
+def _write(block: Block, place: Callable[[str], Path], look: Look) -> str:
     """Write the files of a block; return the PNG of a picture in base64, for the page."""
     if isinstance(block, Table):
         block.write_csv(place(block.name).with_suffix(".csv"))
     if not isinstance(block, Drawing):
         return ""
     path = place(block.name)
-    for form in {*formats, "png"}:
+    for form in {*look.formats, "png"}:
         save_figure(block.figure, path.with_suffix(f".{form}"))
+    if look.panels:
+        figures.save_panels(block.figure, path, look.formats)
     return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 
@@ -240,7 +291,7 @@ def _facts(report: Report) -> dict[str, str]:
         "algorithms": str(len({run.algorithm for run in runs})),
         "experiments": str(len(report.experiments)),
         "environment steps": f"{sum(run.steps for run in runs):,}",
-        "training": inventory.duration(sum(run.hours for run in runs)),
+        "training": scoring.duration(sum(run.hours for run in runs)),
     }
 
 

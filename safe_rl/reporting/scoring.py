@@ -1,25 +1,21 @@
-"""Tables of final scores, of costs during learning, and of normalised scores."""
+"""Tables of final scores, of costs during learning, and of what the folders of runs hold."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import inf, nan
 from statistics import mean
 from typing import Any
 
 import numpy as np
 
+from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.recorded import Run
-from safe_rl.reporting.tables import Record, Table, each_cost, interval, mark_best, spread
+from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval, mark_best, spread
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
 from safe_rl.scores import benchmark, measures
-from safe_rl.scores.benchmark import Normalised
-from safe_rl.scores.comparisons import interquartile_mean
-
-_SYMBOLS = dict(
-    zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
-)
+from safe_rl.scores.bounds import rounded_up
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
@@ -34,12 +30,24 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
         "fewest_steps": lengths[0],
         "most_steps": lengths[-1] if lengths[1:] else None,
         "hours": float(np.mean([run.hours for run in runs])),
-        **_over_seeds([run.final(cost_keys) | _critic_bias(run) for run in runs]),
+        **_over_seeds([run.figures(list(cost_keys)) | _critic_bias(run) for run in runs]),
         **{f"limit_{key}": limit for key, limit in limits.items()},
         **excesses,
+        **({} if any(map(has_episodes, runs)) else _over_seeds([_rates(r) for r in runs])),
         "satisfies": all(excess <= 0 for excess in excesses.values()),
         **_published(experiment),
     }
+
+
+def has_episodes(run: Run) -> bool:
+    """Whether an episode of it has ended."""
+    return bool(run.column("episode_return").size)
+
+
+def _rates(run: Run) -> dict[str, float]:
+    """Return and cost per 1,000 steps of all training, for runs in which no episode has ended."""
+    names = {"return_per_1000": "reward_rate", "cost_per_1000": "cost_rate"}
+    return {k: 1000 * run.table[v][-1] for k, v in names.items() if v in run.table}
 
 
 def _critic_bias(run: Run) -> dict[str, float]:
@@ -61,7 +69,7 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 def _published(experiment: Experiment) -> dict[str, Any]:
     """Published values for the same environment, which no transform changes, and algorithm."""
-    changed = any(run.config.get("transforms") for run in experiment.runs)
+    changed = any(run.settings.get("transforms") for run in experiment.runs)
     if changed or experiment.is_continued or not experiment.has_published_limit:
         return {}
     paper = experiment.reference if experiment.base == "ppo" else None
@@ -94,6 +102,10 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         r"$\rho_c$": spread("rate", 4),
         **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
+    short = [e for e in experiments if not any(map(has_episodes, e.finished))]
+    if short:
+        columns["return per 1,000 steps"] = spread("return_per_1000", 2)
+        columns["cost per 1,000 steps"] = spread("cost_per_1000", 1)
     if "paper_episode_return" in has:
         steps = benchmark.PUBLISHED_STEPS[str(experiments[0].benchmark)]
         title = f"paper, {steps / 1e6:g}M steps"
@@ -102,7 +114,24 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         title = f"later work, {benchmark.REIMPLEMENTATION_STEPS / 1e6:g}M steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
     marks = _final_marks(records, {e.algorithm: (e.lengths, e.limits) for e in experiments})
-    return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
+    note = _on_short_runs(short)
+    return Table(f"final_{environment}", environment, columns, records, note, rows, marks)
+
+
+def _on_short_runs(experiments: Sequence[Experiment]) -> str:
+    """A note on experiments in which no episode has ended, and what to set; "" if there is none."""
+    if not experiments:
+        return ""
+    names = ", ".join(e.algorithm for e in experiments)
+    note = f"No episode of {names} has ended, so there are rates per 1,000 steps instead. "
+    first = experiments[0].runs[0]
+    envs, length = first.settings.get("num_envs"), first.episode_length
+    if isinstance(envs, int) and length:
+        note += (
+            f"Episodes have {length:,} steps and there were {envs} environments: the first end "
+            f"after {envs * length:,} steps (frames=…), earlier with fewer of them (num_envs=…)."
+        )
+    return note
 
 
 def _final_marks(
@@ -164,7 +193,7 @@ def _learning_figures(run: Run) -> dict[str, float]:
     if not run.column("episode_return").size:
         return figures
     width = final_width(run.column("steps"))
-    for key, limit in run.limits.items():
+    for key, limit in run.cost_limits.items():
         judged = costs = run.column(f"episode_{key}")
         if run.limits_another_measure(key):
             violation = run.column(f"violation_{key}")
@@ -174,98 +203,115 @@ def _learning_figures(run: Run) -> dict[str, float]:
     return figures
 
 
-def complete_slates(
-    experiments: Sequence[Experiment], needed: int
-) -> Iterator[tuple[str, list[list[Experiment]]]]:
-    """Slates that one algorithm or more has complete, and the environments that all share.
+_WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
-    Yields the name of a slate, and for each algorithm with at least ``needed`` finished runs per
-    environment its experiments, one per environment, with a limit on ``cost``. Runs that started
-    from another run's networks do not count.
+
+def _each_run(experiments: Sequence[Experiment]) -> Iterator[tuple[dict[str, Any], Run]]:
+    for e in experiments:
+        place = {"environment": e.environment, "algorithm": e.algorithm}
+        yield from (({**place, "seed": run.seed}, run) for run in e.runs)
+
+
+def _names(records: Sequence[Record], start: str) -> list[str]:
+    """The names of all fields with a prefix, without it."""
+    fields = dict.fromkeys(name for record in records for name in record)
+    return [name.removeprefix(start) for name in fields if name.startswith(start)]
+
+
+def run_table(experiments: Sequence[Experiment]) -> Table:
+    """Every run with its final scores, its folder and the command that repeats it."""
+    records = [
+        {
+            **where,
+            "steps": run.steps,
+            "state": "finished" if run.steps >= frames else f"{run.steps / frames:.0%}",
+            "hours": run.hours,
+            "time": duration(run.hours),
+            **run.figures(["cost"]),
+            "folder": clean(run.directory),
+            "code": run.code_text,
+            "command": run.repeating or "not recorded",
+        }
+        for where, run in _each_run(experiments)
+        for frames in [run.settings["frames"]]
+    ]
+    columns = {
+        **_WHERE,
+        "steps": "{steps:,}",
+        "state": "{state}",
+        "time": "{time:}",
+        "steps/s": "{steps_per_second:,.0f}",
+        "$J_r$": "{episode_return:.2f}",
+        "$J_c$": "{episode_cost:.1f}",
+        r"$\rho_c$": "{cost_rate:.4f}",
+        **({"code": "{code}"} if any(r["code"] for r in records) else {}),
+        "command": "{command}",
+    }
+    return Table("runs", "Runs", columns, records)
+
+
+def duration(hours: float) -> str:
+    """A duration in minutes or hours.
+
+    Examples:
+        >>> duration(0.21), duration(2.5)
+        ('13 min', '2.5 h')
     """
-    own: dict[str, dict[str, Experiment]] = {}
-    for e in experiments:
-        if e.benchmark in benchmark.REFERENCE and not e.is_continued:
-            found = own.setdefault(e.algorithm, {})
-            if "cost" in e.limits and e.finished:
-                found[str(e.benchmark)] = e
-    shared = tuple(n for n in benchmark.REFERENCE if all(n in found for found in own.values()))
-    slates = {name: (slate, needed) for name, slate in benchmark.SLATES.items()}
-    shown = []
-    for name, (slate, least) in {**slates, "shared": (shared, 1)}.items():
-        members = [
-            [found[env] for env in slate]
-            for found in own.values()
-            if all(env in found and len(found[env].finished) >= least for env in slate)
-        ]
-        if slate and members and slate not in shown:
-            shown.append(slate)
-            yield name, members
+    return f"{60 * hours:.0f} min" if hours < 1 else f"{hours:,.1f} h"
 
 
-def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.ndarray]]:
-    """Normalised final scores of one algorithm: score -> values per environment, one of a run."""
-    strata: dict[str, list[np.ndarray]] = {name: [] for name in Normalised._fields}
-    for e in experiments:
-        assert e.reference is not None
-        finals = [run.final(["cost"]) for run in e.finished]
-        returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
-        # J_c, or the other measure that the run compares with the limit
-        limit = e.limits["cost"]
-        judged = limit + np.array([run.excess("cost") for run in e.finished])
-        scores = measures.normalise(returns, judged, rates, limit=limit, reference=e.reference)
-        for name, values in zip(strata, scores, strict=True):
-            strata[name].append(values)
-    return strata
-
-
-def _record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
-    """Averages over environments of averages over seeds, and interquartile means of all runs."""
-    strata = normalised_scores(experiments)
-    steps = {steps for e in experiments for steps in e.lengths}
-    record: dict[str, Any] = {
-        "slate": slate,
-        "algorithm": experiments[0].algorithm,
-        "runs": sum(map(len, strata["violation"])),
-        "fewest_steps": min(steps),
-        "most_steps": max(steps) if len(steps) > 1 else None,
-        **{name: float(np.mean([runs.mean() for runs in s])) for name, s in strata.items()},
+def evaluation_table(experiments: Sequence[Experiment]) -> Table:
+    """The results of ``safe-rl evaluate`` of all runs."""
+    runs = _each_run(experiments)
+    records = [{**where, **found} for where, run in runs for found in run.evaluation_records]
+    others = {(e.environment, e.algorithm): e.limits_of_other_measures for e in experiments}
+    total = ["cost"] if any("episode_cost" in record for record in records) else []
+    keys = list(dict.fromkeys([*total, *_names(records, "limit_")]))
+    columns = {
+        **_WHERE,
+        "checkpoint": "{checkpoint}",
+        "episodes": "{episodes:d}",
+        "what": "{manner}",
+        "$J_r$": interval("episode_return", 2),
+        **({"cost": "{cost}"} if len(keys) > 1 else {}),
+        "$J_c$": interval("mean", 1),
+        "$d$": "{limit:g}",
+        # with a decimal: a few of many episodes are not shown as 0 %
+        "P($C$ > $d$)": "{over:.1%}",
+        "CVaR": "{cvar_alpha:.1%}: " + interval("cvar", 1),
     }
-    if record["runs"] > 1:
-        for name in strata:
-            names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
-            record |= zip(names, interquartile_mean(strata[name]), strict=True)
-    paper = benchmark.PUBLISHED.get(slate, {}).get(experiments[0].base)
-    if paper and all(e.has_published_limit for e in experiments):
-        record |= {f"paper_{name}": value for name, value in paper._asdict().items()}
-    return record
+    fields = {"limit": "limit_{}", "over": "over_limit_{}"}
+    for end in ("", "_low", "_high"):
+        fields |= {f"mean{end}": f"episode_{{}}{end}", f"cvar{end}": f"cvar_{{}}{end}"}
+
+    def over(row: Record) -> str:
+        # a limit on another measure than the mean is not judged by these episodes' mean
+        judged = row.get("key") not in others[row["environment"], row["algorithm"]]
+        return "bad" if judged and row.get("mean", 0.0) > row.get("limit", inf) else ""
+
+    rows = each_cost(records, keys, **fields)
+    return Table("evaluations", "Evaluations", columns, records, shown=rows, marks={"$J_c$": over})
 
 
-def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
-    """A slate of `complete_slates` as in the paper's Tables 1 and 2, with published values."""
-    records = [_record(slate, experiments) for experiments in members]
-    # only algorithms for which these are equal are compared
-    rivals = {m[0].algorithm: [(e.lengths, e.limits["cost"]) for e in m] for m in members}
-    columns = {"algorithm": "{algorithm}", "runs": "{runs:d}"}
-    columns["steps"] = "{fewest_steps:,}| to {most_steps:,}"
-    columns |= {symbol: f"{{{name}:.3f}}" for name, symbol in _SYMBOLS.items()}
-    if any("iqm_violation" in record for record in records):
-        columns |= {f"IQM {s}": interval(f"iqm_{name}", 3) for name, s in _SYMBOLS.items()}
-    note = f"On {', '.join(str(e.benchmark) for e in members[0])}."
-    if slate in benchmark.PUBLISHED:
-        columns |= {f"paper {s}": f"{{paper_{name}:.3f}}" for name, s in _SYMBOLS.items()}
-        after = sorted({benchmark.PUBLISHED_STEPS[e] for e in benchmark.SLATES[slate]})
-        note += f" Paper: after {' (Doggo: '.join(f'{n:,}' for n in after)} steps"
-        note += ")." if len(after) > 1 else "."
-
-    def best(name: str, of: Any) -> Any:
-        is_able = lambda r: r["violation"] <= measures.NOISE_OF_ZERO  # noqa: E731
-        return mark_best(records, name, of, is_able, rivals)
-
-    marks = {
-        _SYMBOLS["episode_return"]: best("episode_return", max),
-        _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > measures.NOISE_OF_ZERO else "",
-        _SYMBOLS["cost_rate"]: best("cost_rate", min),
+def certificate_table(experiments: Sequence[Experiment]) -> Table:
+    """The certificates of all runs that have one."""
+    runs = _each_run(experiments)
+    records = [{**where, **run.certificate_record} for where, run in runs if run.certificate_record]
+    columns = {
+        **_WHERE,
+        "certified": "{certified}| at {surely}",
+        "at": "{checkpoint:,} steps",
+        "$J_r$": "{certified_return:.2f}",
+        "bound on": "{cost}",
+        "is": "{bound:.4g}",
+        "limit": "{most:g}",
+        "episodes": "{episodes:d}",
+        "test": "{test}, {actions} actions",
     }
-    title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
-    return Table(f"slate_{slate}", title, columns, records, note, marks=marks)
+    rows = each_cost(records, _names(records, "bound_"), bound="bound_{}", most="most_{}")
+    rows = [{**row, "bound": rounded_up(row.get("bound", nan), 4)} for row in rows]
+    marks = {"certified": lambda row: "bad" if row["certified"] == "no" else ""}
+    note = ""
+    if any(record["test"] == "Student" for record in records):
+        note = "Student: a bound that is too low if rare episodes cost far more than the others."
+    return Table("certificates", "Certificates", columns, records, note, rows, marks)

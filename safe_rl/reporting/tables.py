@@ -1,8 +1,9 @@
-"""Tables of a report: records for CSV, and rows for HTML and LaTeX."""
+"""Tables of a report: records for CSV, rows for HTML and LaTeX, records of notes of runs."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from matplotlib.ticker import EngFormatter
 
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
+from safe_rl.runs.folder import checkpoint_steps
 
 Record = Mapping[str, Any]
 _LATEX = str.maketrans(
@@ -141,12 +143,22 @@ class Table:
             for row in (self.records if self.shown is None else self.shown)
         ]
 
-    def latex(self) -> str:
-        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit."""
+    def latex(self, columns: Sequence[str] = ()) -> str:
+        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit.
+
+        Args:
+            columns: Titles of the columns to write, without ``$`` and backslashes; empty: all.
+        """
         looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
         cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
         frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
-        sides = "".join("r" if number else "l" for number in self.numbers)
+        kept = [
+            place
+            for place, title in enumerate(self.columns)
+            if not columns or re.sub(r"[$\\]", "", title) in columns
+        ]
+        frame = frame.iloc[:, kept]
+        sides = "".join("r" if self.numbers[place] else "l" for place in kept)
         text: str = frame.to_latex(index=False, escape=False, column_format=sides)
         return f"% {clean(self.title)}\n{text}"
 
@@ -181,3 +193,67 @@ def mark_best(
         return "best" if known and math.isclose(record[name], best(known), rel_tol=1e-9) else ""
 
     return mark
+
+
+def read_certificate(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A certificate as a record of tables; any exception if the content is no certificate.
+
+    Its ``checkpoint`` is the number of steps, or None if no policy is certified. ``bound_<name>``
+    is the upper bound on a mean, and ``most_<name>`` its limit. It is "by construction" if no
+    episode can cost more than the limits; ``test`` is the kind of the bounds.
+    """
+    checkpoint, bounds = content["checkpoint"], content["bounds"]
+    highest = content.get("highest") or {}
+    # those of earlier versions are by the name of the bound
+    most = {name: highest.get(name, highest.get(name.partition("_")[2])) for name in bounds}
+    is_sure = all(m is not None and m <= bounds[name]["most"] for name, m in most.items())
+    certified = "by construction" if is_sure else "yes"
+    # before there were two kinds, it was Student's, which is too low if rare episodes cost much
+    kind = {"betting": "betting", "student": "Student"}[content.get("bound", "student")]
+    return {
+        "certified": "no" if checkpoint is None else certified,
+        "surely": None if is_sure else f"{100 * content['level']:.12g}%",  # not rounded up to 100
+        "checkpoint": None if checkpoint is None else checkpoint_steps(Path(str(checkpoint))),
+        "certified_return": _number(content["episode_return"]),
+        "episodes": int(content["episodes"]),
+        "level": float(content["level"]),
+        **{f"bound_{name}": _number(bound["bound"]) for name, bound in bounds.items()},
+        **{f"most_{name}": _number(bound["most"]) for name, bound in bounds.items()},
+        "test": kind,
+        "actions": "mean" if content.get("deterministic") else "sampled",
+    }
+
+
+def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
+    """An evaluation as a record of tables: every estimate and the bounds of its interval."""
+    manner = [str(content["name"])] if content.get("name") else []
+    manner.append("mean actions" if content["deterministic"] else "sampled actions")
+    manner += [f"{key}={value}" for key, value in content["env"].items()]
+    manner.append(f"{content['layouts_trained_on']:.0%} known layouts")
+    record = {
+        "checkpoint": clean(content["checkpoint"]),
+        "steps": content["steps"],
+        "episodes": int(content["episodes"]),
+        "cvar_alpha": float(content["cvar_alpha"]),
+        "manner": clean(", ".join(manner)),
+        **{f"limit_{key}": float(d) for key, d in content["cost_limits"].items()},
+    }
+    for name, estimate in content["estimates"].items():
+        for part, suffix in (("value", ""), ("low", "_low"), ("high", "_high")):
+            record[f"{name}{suffix}"] = _number(estimate[part])
+    return record
+
+
+def read_code(content: Sequence[Mapping[str, Any]]) -> str:
+    """The version and commit of a run's code; of later ones, also the steps at which they began."""
+    parts = []
+    for entry in content[:9]:
+        words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
+        words += ["with changes"] if entry["changed"] else []
+        words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
+        parts.append(" ".join(filter(None, words)))
+    return "; ".join(parts)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

@@ -107,6 +107,7 @@ SLATES: dict[str, tuple[str, ...]] = {
     "SG1": tuple(name for name in REFERENCE if name.endswith("1")),
     "SG2": tuple(name for name in REFERENCE if name.endswith("2")),
     "SG6": ("PointGoal1", "PointGoal2", "PointButton1", "PointPush1", "CarGoal1", "DoggoGoal1"),
+    "SG12": tuple(name for name in REFERENCE if not name.startswith("Doggo")),
     "SG18": tuple(REFERENCE),
     "SGPoint": tuple(name for name in REFERENCE if name.startswith("Point")),
     "SGCar": tuple(name for name in REFERENCE if name.startswith("Car")),

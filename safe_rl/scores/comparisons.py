@@ -23,6 +23,7 @@ __all__ = [
     "mean",
     "pareto_front",
     "share_over",
+    "t_interval",
 ]
 
 
@@ -108,6 +109,29 @@ def bootstrap(
         rng=np.random.default_rng(0),
     )
     return result.confidence_interval.low, result.confidence_interval.high
+
+
+def t_interval(values: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Student's interval of the mean over the last axis, such as seeds; for few values.
+
+    Args:
+        values: Independent values, [..., n].
+
+    Returns:
+        Lower and upper ends, [...]; NaN for a single value, which says nothing about the spread.
+
+    Examples:
+        >>> low, high = t_interval([1.0, 2.0, 3.0])
+        >>> float(low.round(2)), float(high.round(2))
+        (-0.48, 4.48)
+    """
+    values = np.asarray(values, dtype=float)
+    number, centre = values.shape[-1], values.mean(-1)
+    if number < 2:
+        return np.full_like(centre, math.nan), np.full_like(centre, math.nan)
+    quantile = scipy.stats.t.ppf((1 + LEVEL) / 2, number - 1)
+    reach = quantile * values.std(-1, ddof=1) / math.sqrt(number)
+    return centre - reach, centre + reach
 
 
 def mean(values: ArrayLike) -> Estimate:

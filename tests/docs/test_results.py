@@ -8,7 +8,7 @@ import pandas
 import pytest
 import result_tables as results
 
-from safe_rl.reporting.recorded import Run
+from safe_rl.reporting.archive import Run
 
 ROOT = Path(__file__).resolve().parents[2]
 

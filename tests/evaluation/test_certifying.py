@@ -16,7 +16,7 @@ from safe_rl.evaluation import Certificate, CertificateOptions, certify, certify
 from safe_rl.evaluation.certifying import _RANKING, _TEST, _run, _write
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import EvaluationOptions
-from safe_rl.reporting.recorded import read_certificate
+from safe_rl.reporting.tables import read_certificate
 from safe_rl.runs.run import Run
 from safe_rl.scores.certificate import Verdict
 from safe_rl.training.building import build_trainer, seed_everything

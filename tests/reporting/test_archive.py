@@ -112,7 +112,7 @@ def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path
     keep(runs, tmp_path / "kept")
     found = {r.directory.name: r for r in find_runs(tmp_path / "kept")[0] if r.algorithm == "ppo"}
     assert found["seed0"].notes["frames_before"] == 500
-    assert ["frames=3000" in found[seed].command for seed in ("seed0", "seed1")] == [True, False]
+    assert ["frames=3000" in found[seed].repeating for seed in ("seed0", "seed1")] == [True, False]
 
 
 def test_an_archive_that_is_written_half_way_has_the_runs_that_it_had(runs, tmp_path, monkeypatch):
@@ -141,7 +141,7 @@ def test_an_archive_is_not_among_the_runs_and_keeps_others_of_their_names(runs, 
     other = write_run(tmp_path / "b", "CarGoal1").parents[1]
     assert main([str(other), f"archive={tmp_path / 'kept'}"]) == 1
     assert "its run ppo/seed0 is another one" in capsys.readouterr().err
-    assert read_archive(tmp_path / "kept")["ppo/seed0"].config["env"]["name"] == "PointGoal1"
+    assert read_archive(tmp_path / "kept")["ppo/seed0"].settings["env"]["name"] == "PointGoal1"
 
 
 def test_a_run_that_began_again_does_not_replace_the_longer_one(runs, tmp_path):

@@ -40,7 +40,7 @@ def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
     assert main([str(tmp_path)]) == 0
     tex = (tmp_path / "report" / "tables.tex").read_text().replace(r" \\", "")
     first = r"CPO & 0 & yes at 99.95\% & 2,000 steps & 1.50 & mean\_cost & 19.73 & 25 & 400"
-    assert first in tex
+    assert f"{first} & Student, sampled actions" in tex
     assert r"no at 95\% $\triangle$ & -- & -- & mean\_cost & 31.66 & 25 & 400" in tex
     with (tmp_path / "report" / "certificates.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -48,3 +48,25 @@ def test_a_certificate_and_a_missing_one_have_a_row_each(run, tmp_path):
         "CPO": "19.7252",
         next(row["algorithm"] for row in rows if row["algorithm"] != "CPO"): "31.6512",
     }
+
+
+def test_rows_say_what_holds_by_construction_and_which_bound_was_used(tmp_path):
+    given = {
+        "betting": certificate(bound="betting", highest={"cost": 1000.0}, deterministic=True),
+        "ended": certificate(bound="betting", highest={"mean_cost": 25.0}),
+        "older": certificate(),
+    }
+    for algo, content in given.items():
+        run = write_run(tmp_path, algo=algo, **EPOCHS)
+        (run / "certificate.json").write_text(json.dumps(content))
+    assert main([str(tmp_path)]) == 0
+    with (tmp_path / "report" / "certificates.csv").open() as file:
+        rows = {row["algorithm"]: row for row in csv.DictReader(file)}
+    assert {
+        name: (row["certified"], row["test"], row["actions"]) for name, row in rows.items()
+    } == {
+        "betting": ("yes", "betting", "mean"),
+        "ended": ("by construction", "betting", "sampled"),
+        "older": ("yes", "Student", "sampled"),
+    }
+    assert "too low if rare episodes" in (tmp_path / "report" / "report.html").read_text()

@@ -22,9 +22,10 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     # until the shorter one ends, with as many points as the longer one has epochs
     np.testing.assert_allclose(curve.steps, [1000, 1500, 2000])
     np.testing.assert_allclose(curve.mean, [0.2, 0.3, 0.4])
-    # two seeds: the same is drawn twice in half of all resamples
-    np.testing.assert_allclose(curve.low, [0.1, 0.15, 0.2])
-    np.testing.assert_allclose(curve.high, [0.3, 0.45, 0.6])
+    # two seeds: Student's t with one degree of freedom, times the standard error
+    reach = 12.706205 * np.array([0.1, 0.15, 0.2])
+    np.testing.assert_allclose(curve.low, curve.mean - reach)
+    np.testing.assert_allclose(curve.high, curve.mean + reach)
     alone = average(runs[:1], "episode_return", smooth=True)
     np.testing.assert_allclose(alone.mean, [0.0, 1.0, 2.0])
     assert np.isnan(alone.low).all()

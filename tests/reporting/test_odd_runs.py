@@ -55,6 +55,7 @@ UNREADABLE = {
     "env": lambda run: change(run, env="PointGoal1"),
     "frames": lambda run: change(run, frames="many"),
     "init_from": lambda run: change(run, init_from={"a": 1}),
+    "path": lambda run: change_env(run, name="../../../etc/passwd", robot_base="../../robot"),
     "secret": lambda run: change(run, algo={"name": "${oc.env:SECRET}"}),
     "code": lambda run: (run / "config.yaml").write_text(
         "algo: !!python/object/apply:os.system ['touch trace']"
@@ -80,7 +81,6 @@ UNUSUAL = {
     "markup": lambda run: change(run, algo={"name": "<script>alert(1)</script>|`*_["}),
     "braces": lambda run: change_env(run, name="{0.__class__} {{7*7}} {% raise %}"),
     "long key": lambda run: change_env(run, **{"k" * 9_000: 1}),
-    "path": lambda run: change_env(run, name="../../../etc/passwd", robot_base="../../robot"),
     "formula": lambda run: change(run, algo={"name": "=cmd()"}, cost_limits=None),
     "no name": lambda run: change(run, env={}, init_from="/etc"),
     "no limits": lambda run: change(run, cost_limits=...),

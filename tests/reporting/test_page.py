@@ -6,12 +6,14 @@ import re
 from html.parser import HTMLParser
 
 import numpy as np
+import pandas
 import pytest
 from matplotlib.image import imread
 from synthetic import experiments_in, marks, texts_of, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.inventory import evaluation_table
+from safe_rl.reporting.archive import read_archive
+from safe_rl.reporting.scoring import evaluation_table
 from safe_rl.runs.run import Run
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
@@ -93,7 +95,7 @@ def test_everything_is_written(report):
     kinds = {re.match("[a-z]+", name)[0] for name in names}
     assert kinds == {
         "report", "runs", "tables", "evaluations", "final", "learning", "curves", "fronts",
-        "slate", "left",
+        "slate", "paper", "left",
     }  # fmt: skip
     for picture in report.glob("*.png"):
         assert imread(picture).std() > 0
@@ -220,7 +222,7 @@ def test_algorithms_and_formats_can_be_chosen(folder, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["seeds=0"], "at least one run"),
+        (["seeds=0"], "seeds=0: it must be greater than 0"),
         (["formats=bmp"], "png, svg, pdf"),
         (["algos=cup"], "there are runs of ppo"),
     ],
@@ -243,3 +245,34 @@ def test_where_the_page_cannot_be_is_said_before_any_run_is_read(tmp_path, capsy
     assert main([str(tmp_path)]) == 1
     error = capsys.readouterr().err
     assert f"{tmp_path} is read-only. out=FOLDER writes the report elsewhere." in error
+
+
+def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_archived(tmp_path):
+    mine, other = tmp_path / "mine", tmp_path / "held_out"
+    for root in (mine, other):
+        write_run(root, algo="cpo", seed=0, returns=[1.0 if root is mine else 5.0])
+    write_run(other, algo="ppo")
+    write_run(other, env="CarGoal1", algo="ppo")
+    out, kept = tmp_path / "out", tmp_path / "kept"
+    words = [f"out={out}", f"baselines={other}", f"archive={kept}", "labels={cpo: 'Mine, first'}"]
+    assert main([str(mine), *words]) == 0
+    table = pandas.read_csv(out / "final_PointGoal1.csv").set_index("algorithm").episode_return
+    assert table.to_dict() == {"PPO": 1.0, "Mine, first": 1.0, "Mine, first (held_out)": 5.0}
+    assert not (out / "final_CarGoal1.csv").exists()
+    assert list(read_archive(kept)) == ["PointGoal1/cpo/seed0"]
+
+
+def test_pictures_and_tables_for_papers(tmp_path):
+    for algo in ("cpo", "ppo"):
+        write_run(tmp_path, algo=algo, returns=(1.0, 2.0), costs=(3, 4), rates=(0.1, 0.1))
+    words = ["panels=true", "width=4", "formats=pdf", "columns=algorithm,J_r"]
+    assert main([str(tmp_path), *words]) == 0
+    out = tmp_path / "report"
+    parts = {path.name for path in out.glob("curves_*.pdf")}
+    assert parts == {"curves_1.pdf", "curves_2.pdf", "curves_3.pdf", "curves_legend.pdf"}
+    assert b"/Type3" not in (out / "curves.pdf").read_bytes()
+    first = (out / "tables.tex").read_text().split("midrule")[0]
+    assert "algorithm & $J_r$ \\\\" in first
+    curves = pandas.read_csv(out / "curves.csv")
+    cost = curves[(curves.algorithm == "CPO") & (curves.quantity == "cost")]
+    assert cost[["steps", "mean"]].to_numpy().tolist() == [[1000.0, 3.0], [2000.0, 3.5]]

@@ -30,14 +30,15 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     np.testing.assert_allclose(cost_line.get_ydata(), 33.0)
     assert (limit.get_linestyle(), list(limit.get_ydata())) == ("--", [25.0, 25.0])
     band = panels[0, 1].collections[0].get_paths()[0].get_extents()
-    assert (band.ymin, band.ymax) == pytest.approx((30.0, 36.0))
+    # Student's t with one degree of freedom, times a standard error of 3
+    assert (band.ymin, band.ymax) == pytest.approx((33 - 3 * 12.7062, 33 + 3 * 12.7062), abs=0.01)
     assert list(panels[0, 2].lines[-1].get_ydata()) == [0.025, 0.025]
     # the limit of another task, over shorter episodes; and a run that is not finished is dotted
     assert list(panels[2, 2].lines[-1].get_ydata()) == [0.02, 0.02]
     assert panels[2, 0].lines[0].get_linestyle() == ":"
     # where no episode has ended, the cost rate alone gives the name and the steps
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["PPO", "TRPO", "CPO (unfinished)"]
+    assert names == ["PPO", "TRPO (per 1,000 steps)", "CPO (unfinished)"]
     assert panels[1, 0].get_xlim() == panels[1, 2].get_xlim()
 
 

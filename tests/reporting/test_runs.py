@@ -44,9 +44,9 @@ def test_a_run_knows_its_command_and_its_end(tmp_path):
     (tmp_path / "PointGoal1/ppo/seed1/.hydra/overrides.yaml").unlink()
     write_run(tmp_path, seed=2, overrides=[])
     first, second, third = find_runs(tmp_path)[0]
-    assert first.command == "python train.py env=PointGoal1 'cost_limits={cost: 10}' seed=0"
+    assert first.repeating == "python train.py env=PointGoal1 'cost_limits={cost: 10}' seed=0"
     assert (first.steps, first.is_finished, first.hours) == (2000, True, 0.002)
-    assert (second.command, third.command) == (None, "python train.py")
+    assert (second.repeating, third.repeating) == (None, "python train.py")
     assert not second.is_finished
     assert find_runs(tmp_path, unfinished=True)[0][1].is_finished
 
@@ -62,12 +62,12 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
     (run / ".hydra/config.yaml").write_text("frames: 500")
     # it was continued to 1000
     (found,), _ = find_runs(tmp_path)
-    assert found.command == (
+    assert found.repeating == (
         "python train.py '--config-dir=/home/me/my conf' env=PointGoal1 seed=0 frames=1000"
     )
     (run / ".hydra/config.yaml").write_text("frames: ${paper.frames.point}")
     (run / ".hydra/hydra.yaml").unlink()
-    assert find_runs(tmp_path)[0][0].command == "python train.py env=PointGoal1 frames=500 seed=0"
+    assert find_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
 def test_what_is_no_run_is_named_with_its_reason(tmp_path):

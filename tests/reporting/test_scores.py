@@ -2,16 +2,11 @@
 
 import numpy as np
 import pytest
-from synthetic import SUITE, experiments_in, marks, write_run
+from synthetic import SUITE, experiments_in, marks, texts_of, write_run
 
 from safe_rl.reporting.page import Drawing, build_report
-from safe_rl.reporting.scoring import (
-    complete_slates,
-    final_record,
-    final_table,
-    normalised_scores,
-    slate_table,
-)
+from safe_rl.reporting.scoring import final_record, final_table
+from safe_rl.reporting.slates import complete_slates, normalised_scores, paper_table, slate_table
 from safe_rl.reporting.tables import Table
 from safe_rl.scores.benchmark import PUBLISHED_STEPS, REFERENCE, SLATES
 
@@ -232,3 +227,40 @@ def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_
     assert [name for name, mark in found.items() if mark] == ["PPO-Lagrangian", "TRPO-Lagrangian"]
     own = [[e] for e in experiments if e.algorithm in ("CPO", "PPO-Lagrangian", "mine")]
     assert marks(slate_table("SG6", own), r"$\bar M_c$") == ["", "", "bad"]
+
+
+def test_the_papers_tables_have_what_there_is_beside_the_published_values(tmp_path):
+    # PPO's own published scores on two environments, and an algorithm with half of each
+    for env in ("PointGoal1", "CarGoal2"):
+        scores = REFERENCE[env]
+        for algo, factor in (("ppo", 1.0), ("cpo", 0.5), ("trpo_lagrangian", 0.5)):
+            cost = scores.episode_cost if algo == "ppo" else 20.0
+            rate = scores.cost_rate * (factor if algo != "cpo" else 0.6)
+            rows = {"returns": [factor * scores.episode_return], "costs": [cost], "rates": [rate]}
+            write_run(tmp_path, env, algo, **rows)
+    rows = texts_of(paper_table(experiments_in(tmp_path)))
+    slates = {row["slate"] for row in rows}
+    assert slates == {"SG18", "SG12", "SG6", "SG1", "SG2", "SGPoint", "SGCar"}
+    ppo, trpo, cpo = (row for row in rows if row["slate"] == "SG18")
+    figures = [r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"]
+    assert [ppo[name] for name in figures] == ["1.000"] * 3
+    assert [cpo[name] for name in figures] == ["0.500", "0.000", "0.600"]
+    assert [cpo[f"paper {name}"] for name in figures] == ["0.784", "0.593", "0.646"]
+    assert (cpo["environments"], cpo["dominated by"]) == ("2 of 18", "TRPO-Lagrangian")
+    assert (trpo["dominated by"], ppo["dominated by"]) == ("", "")
+
+
+def test_runs_in_which_no_episode_ended_have_rates_and_say_what_they_need(tmp_path):
+    nan = float("nan")
+    rows = {"returns": [nan, nan], "costs": [nan, nan], "rates": [0.05, 0.04]}
+    columns = {"reward_rate": [0.002, 0.003]}
+    write_run(tmp_path, algo="cpo", **rows, columns=columns, num_envs=100)
+    (experiment,) = experiments_in(tmp_path)
+    table = final_table([experiment])
+    (row,) = texts_of(table)
+    assert (row["$J_r$"], row["return per 1,000 steps"]) == ("—", "3.00")
+    assert row["cost per 1,000 steps"] == "40.0"
+    assert "No episode of CPO has ended" in table.note
+    assert "100 environments: the first end after 100,000 steps" in table.note
+    write_run(tmp_path, algo="ppo")
+    assert not final_table([e for e in experiments_in(tmp_path) if e.base == "ppo"]).note

@@ -27,7 +27,8 @@ def test_the_slates_are_made_of_the_suites_constrained_environments():
     }
     assert set(SLATES["SG18"]) == constrained
     assert {name: len(members) for name, members in SLATES.items()} == {
-        "SG1": 9, "SG2": 9, "SG6": 6, "SG18": 18, "SGPoint": 6, "SGCar": 6, "SGDoggo": 6,
+        "SG1": 9, "SG2": 9, "SG6": 6, "SG12": 12, "SG18": 18,
+        "SGPoint": 6, "SGCar": 6, "SGDoggo": 6,
     }  # fmt: skip
     for name, robot in (("SGPoint", "point"), ("SGCar", "car"), ("SGDoggo", "doggo")):
         assert {resolve(member).robot_base for member in SLATES[name]} == {robot}

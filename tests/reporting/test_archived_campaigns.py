@@ -22,7 +22,7 @@ WIDTHS = {"doggo": 2_000_000}  # steps that a column is of, where it is not half
 def test_every_run_can_be_reported_and_every_campaign_is_listed():
     runs, skipped = find_runs(RESULTS)
     assert not skipped
-    assert all(run.command for run in runs)
+    assert all(run.repeating for run in runs)
     # of exploration, runs that were stopped are kept too
     assert all(r.is_finished for r in runs if "hard_tasks" not in r.directory.parts)
     campaigns = {path.name for path in RESULTS.iterdir() if path.is_dir()}
