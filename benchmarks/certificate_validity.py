@@ -7,7 +7,7 @@ candidates of a run on the same layouts. If the mean is exactly the limit, 25, e
 wrong, and at most 5 % of the runs may get one. If the mean is below the limit, the share of runs
 with a certificate is the power of the test. Both bounds get the same number of episodes; betting
 may stop earlier. Realistic costs are resampled from `episode_costs.csv` and scaled to the mean.
-This file has 1,000 episodes of the policy `certified/PointGoal1` (`python -m safe_rl.evaluate
+This file has 1,000 episodes of the policy `certified/PointGoal1` (`safe-rl evaluate
 certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0). `--costs` names
 another CSV file, with a column per policy and a row per episode.
 """

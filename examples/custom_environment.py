@@ -7,7 +7,7 @@ built-in objects, for the same commands:
     python train.py import=examples/custom_environment.py env=PointMines \
         cost_limits='{cost_mines: 10}' frames=400_000
     python train.py resume=RUN_DIR import=examples/custom_environment.py frames=2_000_000
-    python -m safe_rl.evaluate RUN_DIR import=examples/custom_environment.py
+    safe-rl evaluate RUN_DIR import=examples/custom_environment.py
 
 The first takes about a minute on two cores.
 """

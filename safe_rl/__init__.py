@@ -9,7 +9,7 @@ cost accounting.
 from typing import TYPE_CHECKING
 
 import safe_rl.processor  # noqa: F401, must precede torch
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.cli.python_api import Run, evaluate, load, report, resume, train

@@ -1,9 +1,10 @@
-"""Optional packages: installed as extras, imported on demand."""
+"""Imports on demand: of optional packages, and of a package's own names at their first use."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,7 +61,7 @@ def hint_of_plugin(choice: str) -> str:
 def import_extra(module: str, extra: str) -> Any:
     """Import a module that comes with one of the extras, after :func:`require_extra`."""
     require_extra(module, extra)
-    return importlib.import_module(module)
+    return import_module(module)
 
 
 def needs_extra(module: str, extra: str) -> Callable[[T], T]:
@@ -71,3 +72,30 @@ def needs_extra(module: str, extra: str) -> Callable[[T], T]:
         return part
 
     return note
+
+
+def import_later(
+    package: str, homes: Mapping[str, Sequence[str]]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return a package's ``__getattr__`` (PEP 562) and ``__dir__``: names that are imported late.
+
+    Help and error messages need names of environments and keys, but not torch, TorchRL and MuJoCo,
+    which take seconds to import.
+
+    Args:
+        package: Name of the package.
+        homes: Module, named from the package -> names that it defines.
+    """
+    modules = {name: f"{package}.{home}" for home, names in homes.items() for name in names}
+
+    def find(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(import_module(modules[name]), name)
+
+    def names() -> list[str]:
+        own = vars(sys.modules[package])
+        special = {name for name in own if name.startswith("__")}
+        return sorted({*special, *own.get("__all__", ()), *modules})
+
+    return find, names

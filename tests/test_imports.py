@@ -6,8 +6,6 @@ import pytest
 from commands import ROOT, in_a_process
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
-import safe_rl
-
 LAZY = ["safe_rl", "safe_rl.envs", "safe_rl.envs.gymnasium", "safe_rl.envs.velocity"]
 
 
@@ -21,12 +19,6 @@ def test_what_is_imported_later_is_listed_at_once(package):
     assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
 
 
-@pytest.mark.parametrize("name", ["evaluate", "report"])
-def test_a_function_keeps_its_name_when_the_module_of_that_name_is_imported(name):
-    assert import_module(f"safe_rl.{name}").main
-    assert getattr(safe_rl, name) is getattr(import_module("safe_rl.cli.python_api"), name)
-
-
 def test_importing_the_package_takes_no_time_and_imports_neither_torch_nor_its_parts():
     times, names, modules = in_a_process(
         "-c",
@@ -36,7 +28,7 @@ def test_importing_the_package_takes_no_time_and_imports_neither_torch_nor_its_p
     ).splitlines()
     assert float(times) < 0.05
     assert {"Run", "load", "train"} <= set(names.split())
-    assert modules.split() == ["safe_rl", "safe_rl.lazy", "safe_rl.processor"]
+    assert modules.split() == ["safe_rl", "safe_rl.extras", "safe_rl.processor"]
 
 
 OPENMP_SAYS = {"OMP_DISPLAY_ENV": "verbose"}  # libgomp prints its settings when it is loaded

@@ -1,4 +1,4 @@
-"""Evaluate a trained policy: ``python -m safe_rl.evaluate RUN_DIR [episodes=100 video=true]``."""
+"""Evaluate a trained policy: ``safe-rl evaluate RUN_DIR [episodes=100 video=true]``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
 
 
-def main(
-    arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.evaluate"
-) -> int:
+def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
     """Run the command; return its exit status."""
     return run_command(evaluate, arguments, f"{program} RUN_DIR", EvaluationOptions)
 

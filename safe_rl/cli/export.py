@@ -1,4 +1,4 @@
-"""Write a trained policy for others: ``python -m safe_rl.export RUN_DIR policy.onnx``."""
+"""Write a trained policy for others: ``safe-rl export RUN_DIR policy.onnx``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class ExportOptions:
-    """Options of ``python -m safe_rl.export``."""
+    """Options of ``safe-rl export``."""
 
     checkpoint: str = option(
         "", "last, best, certified, or a path; certified if there is one, else last"
@@ -29,7 +29,7 @@ class ExportOptions:
     )
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.export") -> int:
+def main(arguments: Sequence[str] | None = None, program: str = "safe-rl export") -> int:
     """Run the command; return its exit status."""
     places = f"{program} RUN_DIR FILE.onnx|FOLDER"
     return run_command(export, arguments, places, ExportOptions)

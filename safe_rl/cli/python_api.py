@@ -169,7 +169,7 @@ def _carry_out(
 
 
 def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
-    """Run a trained policy for whole episodes, as ``python -m safe_rl.evaluate`` does.
+    """Run a trained policy for whole episodes, as ``safe-rl evaluate`` does.
 
     Args:
         run: The run, or its folder.
@@ -212,7 +212,7 @@ def load(
 
 
 def report(directory: str | Path, **options: Any) -> Path:
-    """Report the runs below a folder on one page, as ``python -m safe_rl.report`` does.
+    """Report the runs below a folder on one page, as ``safe-rl report`` does.
 
     Args:
         directory: The folder.

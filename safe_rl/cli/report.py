@@ -1,4 +1,4 @@
-"""Report a folder of runs: ``python -m safe_rl.report RUNS_DIR [seeds=3 title=...]``."""
+"""Report a folder of runs: ``safe-rl report RUNS_DIR [seeds=3 title=...]``."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     return result, page
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "python -m safe_rl.report") -> int:
+def main(arguments: Sequence[str] | None = None, program: str = "safe-rl report") -> int:
     """Run the command; return its exit status."""
     return run_command(carry_out, arguments, f"{program} RUNS_DIR", ReportOptions)
 

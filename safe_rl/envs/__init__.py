@@ -16,7 +16,7 @@ from safe_rl.envs.families import (
 )
 from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env

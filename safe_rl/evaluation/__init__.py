@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.evaluation.certificate import Certificate

@@ -32,9 +32,9 @@ TESTED_ELSEWHERE = ("README.md", "docs/algorithms")
 LACKING = ("comes with the extra", "cannot be imported in this Python", "if torch finds this GPU")
 # options of our other commands, and what else stands after the folder
 SCHEMAS: dict[str, list] = {
-    "safe_rl.evaluate": [EvaluationOptions],
-    "safe_rl.export": [ExportOptions, "FILE"],
-    "safe_rl.report": [ReportOptions],
+    "evaluate": [EvaluationOptions],
+    "export": [ExportOptions, "FILE"],
+    "report": [ReportOptions],
 }
 BLOCK = re.compile(
     r"^(?:<!-- file: (?P<file>\S+) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S
@@ -70,7 +70,7 @@ def write_files(found: list[Block], place: Path) -> None:
 def commands(text: str) -> list[list[str]]:
     """Words of our commands in a block, without comments and the words before them."""
     lines = text.replace("\\\n", " ").splitlines()
-    found = (re.search(r"python (train\.py|-m safe_rl\.\w+)( .*)?$", line) for line in lines)
+    found = (re.search(r"(python train\.py|safe-rl \w+)( .*)?$", line) for line in lines)
     written = [match.group().removeprefix("python ") for match in found if match]
     return [shlex.split(line, comments=True) for line in written if "…" not in line]
 
@@ -93,7 +93,7 @@ def workplace(tmp_path, monkeypatch):
 def inline(page: str) -> list[list[str]]:
     """Words of our commands that have keys, in sentences and tables."""
     text = BLOCK.sub("", (ROOT / page).read_text())
-    found = re.findall(r"`(python (?:train\.py|-m safe_rl\.\w+) [^`]+)`", text)
+    found = re.findall(r"`((?:python train\.py|safe-rl \w+) [^`]+)`", text)
     return [words for code in found for words in commands(" ".join(code.split()))]
 
 
@@ -101,7 +101,7 @@ def check(words: list[str], run: Path) -> None:
     """Check a command as the program does, up to where it begins to work."""
     place = re.compile(r"^((?:resume|init_from)=)?(?:runs/[\w/.-]+|RUN_DIR)$")
     program, *arguments = [place.sub(lambda m: f"{m[1] or ''}{run}", word) for word in words]
-    if program == "-m":
+    if program == "safe-rl":
         module, _, *options = arguments
         schema, *others = SCHEMAS[module]
         options = options[len(others) :]
@@ -142,7 +142,7 @@ def test_snippets_run_and_commands_are_taken(page, workplace, tiny_run):
 
 @pytest.mark.parametrize(
     "wrong",
-    ["train.py env=PointGaol1", "train.py alog=cpo", "-m safe_rl.evaluate RUN_DIR episode=3"],
+    ["train.py env=PointGaol1", "train.py alog=cpo", "safe-rl evaluate RUN_DIR episode=3"],
 )
 def test_a_wrong_command_is_found(wrong, workplace, tiny_run):
     with pytest.raises(ValueError, match=r"Did you mean|no key|no option|Unknown"):

@@ -38,9 +38,11 @@ def place(tmp_path):
 def command(page, *words):
     """The line of a page that has these words."""
     lines = (DOCS / page).read_text().splitlines()
-    found = [line for line in lines if line.startswith("python ") and all(w in line for w in words)]
+    ours = ("python ", "safe-rl ")
+    found = [line for line in lines if line.startswith(ours) and all(w in line for w in words)]
     assert found, f"{page} has no command with {words}"
-    return shlex.split(found[0], comments=True)[1:]
+    program, *others = shlex.split(found[0], comments=True)
+    return others if program == "python" else ["-m", "safe_rl", *others]
 
 
 def carry_out(words, place, *, seeds=False, fresh=False):
@@ -73,7 +75,7 @@ def test_from_the_first_page_to_a_certified_policy(place):
     said = carry_out(command("start.md", "train.py", "runs/first"), place)
     assert "Certified at 95% with sampled actions: mean_cost ≤" in said
     assert json.loads((place / "runs/first/certificate.json").read_text())["certified"]
-    look = command("start.md", "safe_rl.evaluate", "checkpoint=certified")
+    look = command("start.md", "safe-rl evaluate", "checkpoint=certified")
     quick = [re.sub("episodes=100", "episodes=3", word) for word in look if word != "video=true"]
     assert "3 episodes" in carry_out(quick, place)
     assert (place / "runs/first/evaluation.json").is_file()
@@ -84,7 +86,7 @@ def test_from_an_environment_and_an_algorithm_of_ones_own_to_the_table(place):
     carry_out(
         [word.replace("quadratic,cpo", "quadratic,cpo,ppo") for word in both], place, seeds=True
     )
-    report = command("guides/algorithm.md", "safe_rl.report")
+    report = command("guides/algorithm.md", "safe-rl report")
     carry_out(report, place)
     with (place / "runs/report/final_SlowGoal.csv").open(newline="") as file:
         rows = {row["algorithm"]: row for row in csv.DictReader(file)}
@@ -107,7 +109,7 @@ def test_a_simulator_of_ones_own_is_trained_on(place):
 def test_from_nothing_to_a_dataset_and_to_policies_that_learn_from_it_alone(place):
     page = "off_policy.md"
     carry_out(command(page, "train.py", "runs/expert"), place)
-    recorded = command(page, "safe_rl.evaluate", "record=true")
+    recorded = command(page, "safe-rl evaluate", "record=true")
     carry_out([word.replace("episodes=200", "episodes=40") for word in recorded], place)
     for words in (("algo=bc",), ("algo=sac_lagrangian", "dataset.alone=true")):
         assert "Learning from" in carry_out(command(page, *words), place, fresh=True)

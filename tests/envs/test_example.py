@@ -32,7 +32,7 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
     begun = (*MINES, *SHORT, "collector=process", f"hydra.run.dir={tmp_path}")
     in_a_process("train.py", IMPORT, *begun)
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
-    evaluate = ("-m", "safe_rl.evaluate", str(tmp_path), "episodes=2")
+    evaluate = ("-m", "safe_rl", "evaluate", str(tmp_path), "episodes=2")
     for command in (("train.py", f"resume={tmp_path}", "frames=160"), evaluate):
         said = in_a_process(*command, status=1)
         assert f"was trained with {IMPORT}: add that to the command" in said

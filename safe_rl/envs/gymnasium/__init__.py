@@ -7,7 +7,7 @@ by the ids that `safe_rl.envs.families` registers.
 
 from typing import TYPE_CHECKING
 
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.envs.gymnasium.conversion import make_gymnasium, make_safety_gymnasium

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.envs.torchrl.torchrl_env import make_torchrl

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from safe_rl.envs.velocity.velocity_config import VELOCITY_SUITE, VelocityConfig, resolve_velocity
-from safe_rl.lazy import import_later
+from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.envs.velocity.velocity_env import VelocityEnv
