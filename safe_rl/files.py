@@ -6,11 +6,13 @@ This is directly in ``safe_rl/``, because several folders write files of a run.
 from __future__ import annotations
 
 import csv
+import gzip
 import json
 import math
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -54,20 +56,30 @@ _WITH_EXPONENT = re.compile(r"[-+]?\d+(_\d+)*(\.[\d_]*)?[eE][-+]?\d+$")
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _WITH_EXPONENT, [*"-+0123456789"])
 
 
-def read_bounded(path: Path, most: int = _MOST_BYTES) -> bytes:
-    """Read a regular file of at most ``most`` bytes.
+def read_bounded(path: Path, most: int = _MOST_BYTES, *, packed: bool = False) -> bytes:
+    """Read a regular file of at most ``most`` bytes; if it is ``packed`` by gzip, unpack it.
 
     Raises:
-        ValueError: If it is larger, or not a regular file: reading a pipe could wait forever.
+        ValueError: If it is larger, also after unpacking, or not a regular file: reading a pipe
+            could wait forever.
         OSError: If it cannot be read.
     """
-    if not path.is_file() and path.exists():
-        raise ValueError(f"{path.name} is no regular file")
-    with path.open("rb") as file:
-        content = file.read(min(most, os.fstat(file.fileno()).st_size) + 1)
-    if len(content) > most:
+    # without O_NONBLOCK, opening a pipe waits for a writer
+    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        about = os.fstat(file.fileno())
+        if not stat.S_ISREG(about.st_mode):
+            raise ValueError(f"{path.name} is no regular file")
+        content = b""
+        if about.st_size <= most:
+            content = (gzip.GzipFile(fileobj=file) if packed else file).read(most + 1)
+    if max(about.st_size, len(content)) > most:
         raise ValueError(f"{path.name} has more than {most:,} bytes")
     return content
+
+
+def read_text(path: Path) -> str:
+    """Read a text file of bounded size, without control characters; errors as `read_bounded`."""
+    return printable(read_bounded(path).decode("utf-8", errors="replace"))
 
 
 def read_json(path: Path) -> Any:
@@ -243,21 +255,26 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
 
 
 def check_no_links(folder: Path) -> None:
-    """Refuse a folder that holds links: files written or removed there could lie anywhere.
+    """Refuse a folder that holds anything but files and folders.
 
-    The path of the folder itself may have links. ``wandb/`` may hold links, because Weights &
-    Biases makes some, and nothing else writes there.
+    Files written or removed through links could lie anywhere, and opening a pipe waits. The path of
+    the folder itself may have links. ``wandb/`` may hold links, because Weights & Biases makes
+    some, and nothing else writes there.
 
     Raises:
-        ValueError: If there is a link; the message names the first one.
+        ValueError: If there is a link or a pipe; the message names the first one.
     """
     for place, folders, files in os.walk(folder):
-        link = next((n for n in (*folders, *files) if os.path.islink(Path(place, n))), None)
-        if link is not None:
-            raise ValueError(
-                f"{Path(place, link)} is a link: nothing is written or removed where links could "
-                "lead out of the folder. Replace it by what it points to, or remove it."
-            )
+        for path in (Path(place, name) for name in (*folders, *files)):
+            with suppress(FileNotFoundError):  # removed meanwhile
+                mode = path.lstat().st_mode
+                if stat.S_ISLNK(mode):
+                    raise ValueError(
+                        f"{path} is a link: nothing is written or removed where links could lead "
+                        "out of the folder. Replace it by what it points to, or remove it."
+                    )
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    raise ValueError(f"{path} is no regular file: remove it.")
         if "wandb" in folders and Path(place) == folder:
             folders.remove("wandb")
 

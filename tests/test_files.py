@@ -1,5 +1,6 @@
 """Configurations of strangers, files that are written in one go, and folders that vanish."""
 
+import gzip
 import os
 
 import pytest
@@ -7,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
+from safe_rl.files import check_no_links, read_bounded, read_config, read_json, read_yaml, replacing
+from safe_rl.reporting.archive import read_archive
 from safe_rl.runs import table
 from safe_rl.runs.folder import paths_below
-from safe_rl.runs.run import find_runs
+from safe_rl.runs.run import Run, find_runs
 
 VALUES = st.recursive(
     st.none()
@@ -111,9 +113,28 @@ def test_a_table_of_any_size_and_a_pipe_are_not_read(tmp_path):
         file.truncate(3_000_000_000)
     with pytest.raises(ValueError, match="more than 100,000,000 bytes"):
         table.read_table(sparse)
+    with pytest.raises(ValueError, match="more than 100,000,000 bytes"):
+        _ = Run(tmp_path).num_rows
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe is no regular file"):
         read_bounded(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe is no regular file"):
+        check_no_links(tmp_path)
+
+
+def test_what_unpacks_to_more_than_an_archive_has_is_refused(tmp_path):
+    with gzip.open(tmp_path / "runs.json.gz", "wb") as file:
+        for _ in range(300):
+            file.write(b" " * 1_000_000)
+    with pytest.raises(ValueError, match="more than 200,000,000 bytes"):
+        read_archive(tmp_path)
+
+
+def test_a_table_of_more_columns_than_a_run_has_is_refused(tmp_path):
+    path = tmp_path / "progress.csv"
+    path.write_text("\n".join(",".join(map(str, range(100_000))) for _ in range(2)) + "\n")
+    with pytest.raises(ValueError, match="100,000 columns"):
+        table.read_table(path)
 
 
 def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monkeypatch):

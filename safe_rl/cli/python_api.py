@@ -33,6 +33,7 @@ from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
+from safe_rl.files import read_bounded
 from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.display import outcome_line
 from safe_rl.runs.run import Run as RecordedRun
@@ -286,7 +287,7 @@ class Run(RecordedRun):
         """The same for a notebook, with the learning curves."""
         text = f"<pre>{html.escape(repr(self))}</pre>"
         curves = self.curves_file
-        picture = base64.b64encode(curves.read_bytes()).decode() if curves.is_file() else ""
+        picture = base64.b64encode(read_bounded(curves, 10**8)).decode() if curves.is_file() else ""
         shown = f'<img alt="learning curves" src="data:image/png;base64,{picture}">'
         return text + (shown if picture else "")
 

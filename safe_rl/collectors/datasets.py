@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 
 from safe_rl.collectors.recording import PARTIAL, read_interface, read_recording
 from safe_rl.extras import import_extra
+from safe_rl.files import printable
 
 Arrays = dict[NestedKey, np.ndarray]
 
@@ -34,6 +36,7 @@ _OF_AN_EPISODE = _NAMES | {
     ("next", "truncated"): "truncations",
 }
 _FLAGS = (("next", "terminated"), ("next", "truncated"))
+_MEMORY = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2  # for one array [bytes]
 _ROUNDING = 1e-7  # of a limit: the relative rounding error of costs in single precision is lower
 
 
@@ -137,7 +140,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
       an episode, the step's own observation;
     - Minari: a group ``episode_<i>`` for each episode, with ``observations`` (one more than steps),
       ``actions``, ``rewards``, ``terminations``, ``truncations``, and ``infos`` with ``cost`` and
-      any ``cost_<kind>``. An episode without an end in its last step counts as truncated.
+      any ``cost_<kind>``, one per step, or one more with the reset's 0 first. An episode without
+      an end in its last step counts as truncated.
 
     Raises:
         ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or does not
@@ -145,9 +149,10 @@ def read_hdf5(path: Path | str) -> TensorDict:
         ModuleNotFoundError: If h5py is not installed.
     """
     with open_hdf5(path) as file:
-        episodes = (name for name in file if fullmatch(r"episode_\d+", name))
+        nodes = _nodes(path, file)
+        episodes = (name for name in nodes if fullmatch(r"episode_\d{1,18}", name))
         names = sorted(episodes, key=lambda name: int(name[8:]))
-        arrays = _read_episodes(path, file, names) if names else _read_flat(path, file)
+        arrays = _read_episodes(path, nodes, names) if names else _read_flat(path, nodes)
     number = len(arrays["action"])
     if not number:
         raise ValueError(f"{path} holds no transitions.")
@@ -163,27 +168,50 @@ def read_hdf5(path: Path | str) -> TensorDict:
 def open_hdf5(path: Path | str) -> Iterator[Any]:
     """Open an HDF5 file of unknown origin; errors of reading are ValueErrors."""
     h5py = import_extra("h5py", "hdf5")
-    if not h5py.is_hdf5(path):
+    if not (Path(path).is_file() and h5py.is_hdf5(path)):
         raise ValueError(f"{path} is neither the folder of a recording nor an HDF5 file.")
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read, is it whole? {error}") from error
+    except (OSError, KeyError, RuntimeError, TypeError, MemoryError, UnicodeError) as error:
+        words = printable(" ".join(str(error).split()))
+        raise ValueError(f"{path} cannot be read, is it whole? {words}") from error
 
 
-def _read_episodes(path: Path | str, file: Any, names: list[str]) -> Arrays:
-    episodes = [_read_episode(f"{path}, {name}", file[name]) for name in names]
+def _nodes(place: Path | str, group: Any) -> dict[str, Any]:
+    """The arrays and groups in a group, all of which must be in the file itself."""
+    for name in group:
+        # opening what a link to another file names could wait, or read any file of this machine
+        if not hasattr(group.get(name, getlink=True), "filename"):
+            node = group[name]
+            if not (getattr(node, "external", None) or getattr(node, "is_virtual", False)):
+                continue
+        raise ValueError(f"{place}: its {printable(name)} is in another file, which is not read.")
+    return {name: group[name] for name in group}
+
+
+def _values(place: Path | str, node: Any) -> np.ndarray:
+    if node.nbytes > _MEMORY:
+        raise ValueError(
+            f"{place}: an array has the shape {node.shape}, which does not fit into the memory."
+        )
+    return node[:]
+
+
+def _read_episodes(path: Path | str, nodes: Mapping[str, Any], names: list[str]) -> Arrays:
+    episodes = [_read_episode(f"{path}, {name}", nodes[name]) for name in names]
     for name, episode in zip(names, episodes, strict=True):
         if episode.keys() != episodes[0].keys():
             raise ValueError(f"{path}: {name} has other costs than {names[0]}.")
     return {key: np.concatenate([e[key] for e in episodes]) for key in episodes[0]}
 
 
-def _read_flat(path: Path | str, file: Any) -> Arrays:
-    arrays = _arrays(path, file, _FLAT)
-    if "next_observations" in file:
-        following = file["next_observations"][:]
+def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
+    arrays = _arrays(path, nodes, _FLAT)
+    if "next_observations" in nodes:
+        following, here = _values(path, nodes["next_observations"]), arrays["observation"]
+        if np.array_equal(following, here) and (here != here[:1]).any():
+            raise ValueError(f"{path}: its next_observations are equal to its observations.")
     else:
         _check_shapes(path, arrays)
         here = arrays["observation"]
@@ -194,16 +222,19 @@ def _read_flat(path: Path | str, file: Any) -> Arrays:
 
 
 def _read_episode(place: str, group: Any) -> Arrays:
-    arrays = _arrays(place, group, _OF_AN_EPISODE)
+    nodes = _nodes(place, group)
+    arrays = _arrays(place, nodes, _OF_AN_EPISODE)
     observed, number = arrays["observation"], len(arrays["action"])
     arrays |= {"observation": observed[:number], ("next", "observation"): observed[1 : number + 1]}
-    infos = group.get("infos", {})
-    for name in infos:
-        if name.startswith("cost") and _is_array(infos[name]):
-            # infos of the reset come first, if they were stored
-            arrays["next", name] = infos[name][max(0, len(infos[name]) - number) :]
+    infos = _nodes(place, nodes.get("infos", {}))
+    for name, node in infos.items():
+        if name.startswith("cost") and _is_array(node):
+            cost = _values(place, node)
+            if len(cost) == number + 1 and not cost[:1].any():
+                cost = cost[1:]  # the first is that of the reset
+            arrays["next", name] = cost
     if ("next", "cost") not in arrays:
-        raise ValueError(f"{place} has no infos/cost. What it has: {', '.join(infos)}.")
+        raise ValueError(f"{place} has no infos/cost. What it has: {printable(', '.join(infos))}.")
     _check_shapes(place, arrays)
     arrays["next", "truncated"][-1:] |= ~arrays["next", "terminated"][-1:]
     return arrays
@@ -214,14 +245,14 @@ def _is_array(node: Any) -> bool:
     return bool(getattr(node, "shape", ()))
 
 
-def _arrays(place: Path | str, group: Any, names: Mapping[NestedKey, str]) -> Arrays:
-    found = [name for name in group if _is_array(group.get(name))]
+def _arrays(place: Path | str, nodes: Mapping[str, Any], names: Mapping[NestedKey, str]) -> Arrays:
+    found = [name for name, node in nodes.items() if _is_array(node)]
     if missing := sorted(set(names.values()) - set(found)):
         raise ValueError(
             f"{place} has no {', '.join(missing)}: transitions are read from files like those of "
-            f"DSRL or Minari. What it has: {', '.join(found) or 'nothing'}."
+            f"DSRL or Minari. What it has: {printable(', '.join(found)) or 'nothing'}."
         )
-    arrays = {key: group[name][:] for key, name in names.items()}
+    arrays = {key: _values(place, nodes[name]) for key, name in names.items()}
     return arrays | {key: arrays[key].astype(bool) for key in _FLAGS}
 
 

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.build_part import find_algorithm
 from safe_rl.envs import ConfigError, ConstrainedEnv, make_env
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
-from safe_rl.files import read_json, replace_json
+from safe_rl.files import check_no_links, read_json, replace_json
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, check_interface
 from safe_rl.runs.run import Run
@@ -86,6 +86,8 @@ def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
     path = run.robot_folder / str(note["file"]) if note["file"] else original
     if path is None or not path.is_file():
         raise ConfigError(f"'robot_base': there is no file {path}, with which the run began.")
+    if note["file"]:
+        check_no_links(run.robot_folder)  # MuJoCo would wait for a pipe
     home = run.robot_folder if note["file"] else Path(path.anchor or ".")
     if not is_robot(path, home, content):
         raise ConfigError(f"'robot_base': {path} has changed since the run began.")

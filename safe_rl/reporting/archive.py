@@ -8,6 +8,7 @@ read are left out, with a reason.
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import os
 import shlex
@@ -21,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from safe_rl.extras import import_extra
-from safe_rl.files import read_config, read_json, read_yaml, replacing
+from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
@@ -30,6 +31,7 @@ from safe_rl.runs.outcome import judges_another_measure
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
+_MOST_BYTES = 200_000_000  # of either file when it is unpacked
 
 
 class Run(folders.Run):
@@ -282,7 +284,7 @@ def read_archive(folder: Path | str) -> dict[str, Run]:
     """
     folder = Path(folder)
     try:
-        entries = json.loads(gzip.decompress((folder / RUNS).read_bytes()))
+        entries = json.loads(read_bounded(folder / RUNS, _MOST_BYTES, packed=True))
         tables = dict(_tables(folder / ROWS))
         return {
             name: Run(folder / name, notes.pop("config"), tables.get(name, {}), notes)
@@ -297,7 +299,8 @@ def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     pandas = import_extra("pandas", "report")
     kinds = defaultdict(lambda: "float", run="str")
     # only an empty field is no number: "NA" is the name of a run
-    rows = pandas.read_csv(path, dtype=kinds, keep_default_na=False, na_values=[""])
+    text = io.BytesIO(read_bounded(path, _MOST_BYTES, packed=True))
+    rows = pandas.read_csv(text, dtype=kinds, keep_default_na=False, na_values=[""])
     for name, table in rows.groupby("run", sort=False):
         own = table.drop(columns="run")
         known = own.columns[own.notna().any()]

@@ -13,7 +13,7 @@ from platform import node
 
 from filelock import FileLock, Timeout
 
-from safe_rl.files import check_no_links
+from safe_rl.files import check_no_links, read_text
 
 _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
 # the end of the name of a run's folder, as commands make it: date, seed, number of a repetition
@@ -127,7 +127,7 @@ def lock_folder(file: Path) -> Iterator[None]:
             stack.enter_context(lock)
             file.write_text(f"process {os.getpid()} on {node()}")
         except Timeout:
-            writer = file.read_text() or "another process"
+            writer = read_text(file) or "another process"
             raise RunInUseError(
                 f"{directory} is being written by {writer}. Wait for it, or end it; a run that was "
                 "ended is continued by resume=."

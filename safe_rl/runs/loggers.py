@@ -19,7 +19,7 @@ from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
 from safe_rl.checks import Text
 from safe_rl.extras import import_extra, needs_extra
-from safe_rl.files import replace_text
+from safe_rl.files import read_text, replace_text
 from safe_rl.runs.run import Run
 
 
@@ -98,7 +98,7 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
         path = Run(self._directory).logger_id_file("mlflow")
         self.id = self._mlflow.set_experiment(self.exp_name).experiment_id
         run = self._mlflow.start_run(
-            run_id=path.read_text() if path.exists() else None,
+            run_id=read_text(path) if path.exists() else None,
             experiment_id=self.id,
             run_name=str(self._directory),
         )
@@ -130,7 +130,7 @@ class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     ) -> None:
         import_extra("wandb", extra="wandb")
         path = Run(log_dir).logger_id_file("wandb")
-        run_id = path.read_text() if path.exists() else token_hex(4)
+        run_id = read_text(path) if path.exists() else token_hex(4)
         replace_text(path, run_id)
         super().__init__(
             exp_name, offline=offline, project=project, log_dir=log_dir, id=run_id, **kwargs

@@ -16,10 +16,10 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.checks import is_number
-from safe_rl.files import read_config, read_json, read_yaml
+from safe_rl.files import read_bounded, read_config, read_json, read_yaml
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
 from safe_rl.runs.outcome import final_figures, violation
-from safe_rl.runs.table import read_table
+from safe_rl.runs.table import MOST_BYTES, read_table
 
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
@@ -170,7 +170,7 @@ class Run:
     def num_rows(self) -> int:
         """Finished epochs in the table."""
         try:
-            lines = self.table_file.read_bytes().count(b"\n")
+            lines = read_bounded(self.table_file, MOST_BYTES).count(b"\n")
         except FileNotFoundError:
             return 0
         return max(0, lines - 1)

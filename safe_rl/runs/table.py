@@ -13,7 +13,8 @@ from safe_rl.files import read_bounded, replace_text
 __all__ = ["TableError", "TableWriter", "read_table"]
 
 # largest size of a table [bytes]; ten thousand epochs with a hundred columns have about 20 million
-_MOST_BYTES = 100_000_000
+MOST_BYTES = 100_000_000
+_MOST_COLUMNS = 10_000
 
 
 class TableError(ValueError):
@@ -94,7 +95,7 @@ def _first_rows(path: Path, number: int) -> list[str]:
 def _complete_lines(path: Path) -> list[str]:
     """Lines of a table without the last one if its end is still missing."""
     try:
-        lines = read_bounded(path, _MOST_BYTES).decode().splitlines(keepends=True)
+        lines = read_bounded(path, MOST_BYTES).decode().splitlines(keepends=True)
     except UnicodeDecodeError:
         raise TableError(f"{path} is no table: it is not text.") from None
     return [line for line in lines if line.endswith("\n")]
@@ -113,6 +114,8 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
         TableError: If a row has more or fewer fields than the header, or a field is no number.
     """
     names, *rows = csv.reader(lines) if lines else [[]]
+    if len(names) > _MOST_COLUMNS:
+        raise TableError(f"{path} has {len(names):,} columns, more than any run writes.")
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise TableError(

@@ -161,6 +161,7 @@ def write_minari(h5py, path, lengths=(3, 12), reset_infos=True):
                 "truncations": np.zeros(length, bool),
             }  # fmt: skip
             cost = rng.integers(0, 2, length + reset_infos).astype(float)
+            cost[: int(reset_infos)] = 0
             group = file.create_group(f"episode_{number}")
             for name, array in episode.items():
                 group[name] = array
@@ -208,6 +209,7 @@ def test_what_is_no_dataset_is_refused(tmp_path, h5py):
         ({"actions": np.array([b"left"] * 6)}, "the action must be numbers"),
         ({"costs": np.zeros((6, 2))}, r"the next cost must be numbers of shape \(6,\), as"),
         ({"next_observations": np.zeros((6, 4))}, r"numbers of shape \(6, 3\),.* shape \(6, 4\)"),
+        ({"next_observations": "observations"}, "next_observations are equal to its observations"),
     ],
 )
 def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path, h5py):
@@ -217,9 +219,61 @@ def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_p
         for name, array in changes.items():
             del file[name]
             if array is not None:
-                file[name] = array
+                file[name] = file[array][:] if isinstance(array, str) else array
     with pytest.raises(ValueError, match=told):
         read_hdf5(path)
+
+
+def foreign(h5py, folder, kind):
+    """What a file can hold instead of an array of its own."""
+    (folder / "secret").write_bytes(np.ones(6).tobytes())
+    with h5py.File(folder / "other.hdf5", "w") as other:
+        other["rewards"] = np.ones(6)
+    with h5py.File(folder / "data.hdf5", "a") as file:
+        del file["rewards"]
+        if kind == "external":
+            raw = [(str(folder / "secret"), 0, 48)]
+            file.create_dataset("rewards", (6,), "f8", external=raw)
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout((6,), "f8")
+            layout[:] = h5py.VirtualSource(str(folder / "other.hdf5"), "rewards", (6,))
+            file.create_virtual_dataset("rewards", layout)
+        elif kind == "linked":
+            file["rewards"] = h5py.ExternalLink(str(folder / "other.hdf5"), "rewards")
+        elif kind == "loop":
+            file["rewards"], file["costs2"] = h5py.SoftLink("/costs2"), h5py.SoftLink("/rewards")
+        elif kind == "huge":
+            file.create_dataset("rewards", (1 << 40,), "f8", chunks=(1024,))
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        *((kind, "its rewards is in another file") for kind in ("external", "virtual", "linked")),
+        ("loop", "cannot be read, is it whole"),
+        ("huge", "does not fit into the memory"),
+    ],
+)
+def test_files_that_lead_elsewhere_or_never_end_are_refused(kind, told, tmp_path, h5py):
+    write_hdf5(h5py, tmp_path / "data.hdf5")
+    foreign(h5py, tmp_path, kind)
+    with pytest.raises(ValueError, match=told):
+        read_hdf5(tmp_path / "data.hdf5")
+
+
+def test_a_file_with_flipped_bits_is_read_or_refused_in_one_line(tmp_path, h5py):
+    write_hdf5(h5py, tmp_path / "data.hdf5")
+    content, refusals = (tmp_path / "data.hdf5").read_bytes(), []
+    for place in range(0, len(content), 97):
+        damaged = bytearray(content)
+        damaged[place] ^= 0xFF
+        (tmp_path / "data.hdf5").write_bytes(damaged)
+        try:
+            read_hdf5(tmp_path / "data.hdf5")
+        except ValueError as error:
+            refusals.append(str(error))
+    assert refusals
+    assert not any("\n" in words for words in refusals)
 
 
 @pytest.mark.parametrize(
@@ -227,6 +281,8 @@ def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_p
     [
         ("observations", np.zeros((1, 3)), "episode_4: the next observation must be"),
         ("infos/cost", np.zeros((1, 2)), "episode_4: the next cost must be"),
+        ("infos/cost", np.zeros(3), "episode_4: the next cost must be"),
+        ("infos/cost", np.ones(2), "episode_4: the next cost must be"),
         ("infos/cost_hazards", None, "episode_4 has other costs than episode_0"),
         ("infos/cost", "group", "no infos/cost"),
     ],
@@ -251,7 +307,7 @@ def test_episodes_without_a_step_and_other_groups_are_passed_over(tmp_path, h5py
         empty = file.create_group("episode_12")
         for key, shape in {"observations": (1, 3), "actions": (0, 2), "infos/cost": 1,
                            "infos/cost_hazards": 1}.items():  # fmt: skip
-            empty[key] = np.ones(shape)
+            empty[key] = np.zeros(shape)
         for key in ("rewards", "terminations", "truncations"):
             empty[key] = np.zeros(0)
     assert (read_hdf5(tmp_path / "data.hdf5") == whole).all()

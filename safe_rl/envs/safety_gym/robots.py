@@ -20,12 +20,15 @@ import mujoco
 
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import BUNDLED, PATHS_OF_2019, robot_path
+from safe_rl.files import read_bounded
 from safe_rl.naming import did_you_mean
 
 
 def fingerprint(path: Path) -> str:
     """Return a hash of the contents of a robot's files, which does not depend on their names."""
-    contents = sorted(hashlib.sha256(file.read_bytes()).hexdigest() for file in robot_files(path))
+    contents = sorted(
+        hashlib.sha256(read_bounded(file, 10**9)).hexdigest() for file in robot_files(path)
+    )
     return hashlib.sha256(" ".join(contents).encode()).hexdigest()
 
 
