@@ -31,7 +31,6 @@ API = {
     "safe_rl.evaluation": "Evaluation and certificates",
     "safe_rl.scores.certificate": "Claims and their bounds",
     "safe_rl.scores.comparisons": "Intervals",
-    "safe_rl.scores.measures": "Normalised scores",
     "safe_rl.reporting": "Reports",
     "safe_rl.runs.table": "Tables of runs",
 }

@@ -324,7 +324,8 @@ class Run(RecordedRun):
         """Certify the best checkpoint that keeps the limits, as at the end of training.
 
         Args:
-            changes: Keys of the section ``certificate`` to change, such as ``episodes=2000``.
+            changes: Keys of the section ``certificate`` to change, such as ``episodes=2000``; and
+                ``deterministic=True`` to certify the policy with its mean actions.
 
         Returns:
             The certificate; None if the run has no limits or no checkpoints.

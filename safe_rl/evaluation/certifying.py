@@ -109,7 +109,8 @@ def certify(
 def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) -> tuple[int, float]:
     """Number and error probability of a test of a run; both are noted before its first episode."""
     tests = read_json(run.tests_file) if run.tests_file.is_file() else []
-    asked = {"options": asdict(options), "candidates": [path.name for path in candidates]}
+    asked = {"options": asdict(options), "limits": run.cost_limits}
+    asked["candidates"] = [path.name for path in candidates]
     for number, former in enumerate(tests, 1):
         if all(former[key] == value for key, value in asked.items()):
             return number, former["error"]

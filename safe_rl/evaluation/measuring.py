@@ -27,9 +27,8 @@ from safe_rl.evaluation.video import check_camera, record_episode, video_format,
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
-from safe_rl.scores.benchmark import Scores, Suite
+from safe_rl.scores.benchmark import Scores, Suite, normalise
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
-from safe_rl.scores.measures import normalise
 
 # keys of the choice of layouts: with other values it is still the same environment
 _LAYOUTS = ("layout_seeds", "layout_seeds_first")

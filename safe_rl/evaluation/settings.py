@@ -150,7 +150,7 @@ def certificate_options(
     With ``risk=chance`` the share of episodes above the limit is certified as well; with
     ``risk=cvar`` the mean cost of the costliest episodes.
     """
-    options = dict(config.certificate)
+    options = {**config.certificate, "deterministic": False}
     for name, value in (changes or {}).items():
         if name not in options:
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")

@@ -14,7 +14,7 @@ from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval, mark_best, spread
 from safe_rl.runs.outcome import FINAL_EPOCHS, final_rows, final_width
-from safe_rl.scores import benchmark, measures
+from safe_rl.scores import benchmark
 from safe_rl.scores.bounds import rounded_up
 
 
@@ -198,8 +198,8 @@ def _learning_figures(run: Run) -> dict[str, float]:
         if run.limits_another_measure(key):
             violation = run.column(f"violation_{key}")
             judged = np.where(np.isfinite(violation), limit + violation, costs)
-        spans = measures.joined(judged, width // FINAL_EPOCHS)
-        figures |= {f"{name}_{key}": v for name, v in measures.learning_cost(spans, limit).items()}
+        spans = benchmark.joined(judged, width // FINAL_EPOCHS)
+        figures |= {f"{name}_{key}": v for name, v in benchmark.learning_cost(spans, limit).items()}
     return figures
 
 

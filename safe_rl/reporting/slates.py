@@ -9,7 +9,7 @@ import numpy as np
 
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.tables import Record, Table, interval, mark_best
-from safe_rl.scores import benchmark, measures
+from safe_rl.scores import benchmark
 from safe_rl.scores.benchmark import Normalised
 from safe_rl.scores.comparisons import interquartile_mean
 
@@ -57,7 +57,7 @@ def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.nd
         # J_c, or the other measure that the run compares with the limit
         limit = e.limits["cost"]
         judged = limit + np.array([run.excess("cost") for run in e.finished])
-        scores = measures.normalise(returns, judged, rates, limit=limit, reference=e.reference)
+        scores = benchmark.normalise(returns, judged, rates, limit=limit, reference=e.reference)
         for name, values in zip(strata, scores, strict=True):
             strata[name].append(values)
     return strata
@@ -103,12 +103,12 @@ def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
         note += ")." if len(after) > 1 else "."
 
     def best(name: str, of: Any) -> Any:
-        is_able = lambda r: r["violation"] <= measures.NOISE_OF_ZERO  # noqa: E731
+        is_able = lambda r: r["violation"] <= benchmark.NOISE_OF_ZERO  # noqa: E731
         return mark_best(records, name, of, is_able, rivals)
 
     marks = {
         _SYMBOLS["episode_return"]: best("episode_return", max),
-        _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > measures.NOISE_OF_ZERO else "",
+        _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > benchmark.NOISE_OF_ZERO else "",
         _SYMBOLS["cost_rate"]: best("cost_rate", min),
     }
     title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
@@ -163,7 +163,7 @@ def _dominating(record: Record, records: Sequence[Record]) -> list[str]:
         other["algorithm"]
         for other in records
         if (other["slate"], other["there"]) == (record["slate"], record["there"])
-        and max(other["violation"], record["violation"]) <= measures.NOISE_OF_ZERO
+        and max(other["violation"], record["violation"]) <= benchmark.NOISE_OF_ZERO
         and figures(other) != figures(record)
         and all(a >= b for a, b in zip(figures(other), figures(record), strict=True))
     ]

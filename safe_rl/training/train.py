@@ -9,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -101,6 +100,12 @@ def train(
             if not continues:
                 _check_is_free(run, again, "hydra.run.dir" if program else "directory")
             trainer = _prepare(config, run, continues, callbacks, say)
+            if config.frames < (first := config.num_envs * trainer.episode_length):
+                say(
+                    f"No episode will end: {config.num_envs} environments with episodes of "
+                    f"{trainer.episode_length:,} steps end their first ones after {first:,} frames. "
+                    "Set frames=… or num_envs=…; until then there are rates per 1,000 steps."
+                )
             if hydra is not None and not (continues and run.notes_folder.exists()):
                 _write_notes(run, config, hydra)
             with _during_training():
@@ -162,7 +167,8 @@ def certify_run(
         ValueError: If there is no such key, or it cannot have the value.
     """
     run = Run(directory)
-    options = replace(certificate_options(run.config, changes), deterministic=deterministic)
+    asked = {**(changes or {}), **({"deterministic": True} if deterministic else {})}
+    options = certificate_options(run.config, asked)
     make = maker_of(run.directory)
     with lock_folder(run.lock_file):  # an unwritable folder is found before hours of tests
         return certify(

@@ -8,7 +8,7 @@ import pytest
 
 from safe_rl.reporting.archive import RUNS as FILE
 from safe_rl.reporting.archive import find_runs, read_archive
-from safe_rl.scores.measures import joined
+from safe_rl.scores.benchmark import joined
 
 RESULTS = Path(__file__).parents[2] / "results"
 PAGE = (RESULTS / "README.md").read_text()

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
 from safe_rl.files import CONF
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
+from safe_rl.reporting.experiments import PACKAGED
 from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts
 from safe_rl.reporting.scoring import final_table
 from safe_rl.runs.curves import save_figure
@@ -169,3 +171,13 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     assert len(shown["PointGoal1, 1k steps"].containers) == 2
     labels = shown["PointGoal1, 1k steps"].get_legend_handles_labels()[1]
     assert labels == ["PPO", "CPO"]
+
+
+def test_other_algorithms_have_colours_far_from_the_packages(tmp_path):
+    for algo in ("mine", "yours", "theirs", *sorted(PACKAGED)):
+        write_run(tmp_path, algo=algo)
+    experiments = experiments_in(tmp_path)
+    colours = {e.base: algorithm_styles(experiments)[e.label].colour for e in experiments}
+    ours = np.array([to_rgb(colours[name]) for name in PACKAGED])
+    for name in ("mine", "yours", "theirs"):
+        assert np.linalg.norm(ours - to_rgb(colours[name]), axis=1).min() > 0.35, name

@@ -12,8 +12,8 @@ from safe_rl.scores.benchmark import (
     REIMPLEMENTATIONS,
     SLATES,
     Scores,
+    normalise,
 )
-from safe_rl.scores.measures import normalise
 
 BENCHMARK = suite()
 NODE = BENCHMARK.environments["PointGoal1"]

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from safe_rl.scores.benchmark import learning_cost
 from safe_rl.scores.comparisons import (
     bootstrap,
     cvar,
@@ -21,7 +22,6 @@ from safe_rl.scores.comparisons import (
     pareto_front,
     share_over,
 )
-from safe_rl.scores.measures import learning_cost
 
 
 def test_the_interval_of_a_mean_is_the_normal_one_for_many_values():
