@@ -103,7 +103,7 @@ def train(
             if config.frames < (first := config.num_envs * trainer.episode_length):
                 say(
                     f"No episode will end: {config.num_envs} environments with episodes of "
-                    f"{trainer.episode_length:,} steps end their first ones after {first:,} frames. "
+                    f"{trainer.episode_length:,} steps end the first ones after {first:,} frames. "
                     "Set frames=… or num_envs=…; until then there are rates per 1,000 steps."
                 )
             if hydra is not None and not (continues and run.notes_folder.exists()):
