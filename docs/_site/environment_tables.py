@@ -6,10 +6,8 @@ import inspect
 import math
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
-import mujoco
-from result_tables import table
+from result_tables import markdown as table
 
 from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
 from safe_rl.envs.safety_gym.config_keys import Keys
@@ -18,7 +16,6 @@ from safe_rl.envs.safety_gym.elements import ELEMENTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
 _NAMES = ("Point", "Car", "Doggo")
-_ROBOTS = Path(inspect.getfile(SafetyGymEnv)).parent / "robots"
 # pattern of names -> unit, meaning, and keys that turn these components of the observation on
 COMPONENTS = {
     "accelerometer": ("m/s²", "acceleration of the robot's frame, gravity included", ""),
@@ -187,25 +184,4 @@ def costs() -> str:
     return table(["cost", "it is positive if", "switched on by"], rows)
 
 
-def robots() -> str:
-    """Actuators and sensors of the robots that come with the package, from their files."""
-    text = []
-    for name in _NAMES:
-        model = mujoco.MjModel.from_xml_path(str(_ROBOTS / f"{name.lower()}.xml"))
-        actuators = [
-            (f"`{model.actuator(i).name}`", "[{:g}, {:g}]".format(*model.actuator_ctrlrange[i]))
-            for i in range(model.nu)
-        ]
-        sizes = {model.sensor(i).name: model.sensor_dim[i] for i in range(model.nsensor)}
-        sensors = [(f"`{shown}`", len(g), sizes[g[0]]) for shown, g in _alike([*sizes])]
-        text += [
-            f"## {name}",
-            f"{model.nu} actuators, {model.nv} degrees of freedom, "
-            f"{float(model.body_subtreemass[0]):.3g} kg.",
-            table(["actuator", "range of the control"], actuators),
-            table(["sensor", "number", "size of each"], sensors),
-        ]
-    return "\n\n".join(text)
-
-
-TABLES = (benchmark, debug, velocity, keys, observations, lidars, costs, robots)
+TABLES = (benchmark, debug, velocity, keys, observations, lidars, costs)

@@ -2,13 +2,12 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
 import pytest
 import result_tables as results
-
-from safe_rl.reporting.archive import Run
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -26,7 +25,7 @@ def run_of(costs, steps=10_000, certificate=None):
         "episode_cost": costs,
         "cost_rate": [0.5] * len(costs),
     }
-    return Run(Path("run"), {}, table, {"certificate": certificate} if certificate else {})
+    return SimpleNamespace(table=table, notes={"certificate": certificate})
 
 
 def test_figures_are_those_of_the_end_and_of_spans_of_20_000_steps():
@@ -42,10 +41,12 @@ def test_figures_are_those_of_the_end_and_of_spans_of_20_000_steps():
 
 
 def test_a_row_has_the_mean_and_the_deviation_among_seeds():
-    group = pandas.DataFrame({"run": [run_of([10.0, 20.0]), run_of([10.0, 30.0])]})
-    row = results.means(group, last=10_000)
-    assert (row["seeds"], row["cost"], row["return"]) == ("2", "25.0 ± 7.1", "2.0 ± 0.0")
-    assert results.means(group[:1], last=10_000)["cost"] == "20.0"
+    names = dict.fromkeys(("environment", "algorithm", "name"), "")
+    runs = [run_of([10.0, 20.0]), run_of([10.0, 30.0])]
+    group = pandas.DataFrame([names | {"run": run} for run in runs])
+    row = results.summary(group, last=10_000)
+    assert (row["seeds"], row["cost"], row["return"]) == (2, "25.0 ± 7.1", "2.0 ± 0.0")
+    assert results.summary(group[:1], last=10_000)["cost"] == "20.0"
 
 
 def test_certificates_are_counted_among_the_runs_that_were_tested():
@@ -112,7 +113,7 @@ def test_what_is_said_of_hard_tasks():
         returns = results.certified(held.query("environment == @env")).partition("at ")[2]
         assert f"{returns} on {env}" in said("README.md")
     goal = held.query("environment == 'PointGoal2'")
-    assert f"_c {results.means(goal, 5e5)['rate']})" in said("README.md")
+    assert f"_c {results.summary(goal, 5e5)['rate']})" in said("README.md")
 
 
 def test_the_first_command_of_readme():
