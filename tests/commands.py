@@ -1,6 +1,7 @@
 """The command train.py in this process, and any program in one of its own."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,7 +34,9 @@ def status_of(*arguments: str) -> object:
 
 def composed(*words: str) -> list[DictConfig]:
     """The checked configurations that a command line begins runs with, at most four of a sweep."""
-    words = train.prepare(words)
+    words = re.sub(
+        r"(--c(?:onfig-dir|onfig-name|fg))\n", r"\1=", "\n".join(train.prepare(words))
+    ).split("\n")
     folders = [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
     names = [word.partition("=")[2] for word in words if word.startswith("--config-name=")]
     words = [word for word in words if not word.startswith("-")]
