@@ -151,3 +151,14 @@ def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monk
     monkeypatch.setattr(os, "scandir", vanish)
     assert [run.directory.name for run in find_runs(tmp_path)] == ["a", "b"]
     assert paths_below(tmp_path, "*.mp4") == []
+
+
+def test_a_hint_does_not_search_a_whole_disk(tmp_path, monkeypatch):
+    for number in range(1_100):
+        (tmp_path / "a" / str(number)).mkdir(parents=True)
+    list_folder, seen = os.scandir, []
+    monkeypatch.setattr(os, "scandir", lambda path: (seen.append(path), list_folder(path))[1])
+    with pytest.raises(FileNotFoundError, match="not the folder of a run"):
+        Run(tmp_path).check_is_run()
+    assert len(seen) <= 1_001
+    assert len(paths_below(tmp_path, "*")) == 1_101

@@ -31,6 +31,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.checks import check_value
+from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def run_command(
     except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)

@@ -28,7 +28,7 @@ from safe_rl.cli.schema import check_settings
 from safe_rl.cli.sweeps import run_in_sweep
 from safe_rl.cli.user_code import import_modules, split_imports, take_word
 from safe_rl.envs import store_configs
-from safe_rl.files import CONF
+from safe_rl.files import CONF, printable
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES
 
@@ -51,7 +51,7 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
     except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
         if before[1] == "1":  # the user wants to see the traceback
             raise
-        sys.exit(explain(error, sys.argv[1:]))
+        sys.exit(printable(explain(error, sys.argv[1:])))
     except KeyboardInterrupt:
         sys.exit("Interrupted.")
     finally:
@@ -114,7 +114,7 @@ def job(config: DictConfig) -> float | None:
     except (OmegaConfBaseException, ValueError) as error:
         with suppress(OSError):
             directory.rmdir()  # Hydra has made it; a folder with files stays
-        sys.exit(explain(error, sys.argv[1:]))
+        sys.exit(printable(explain(error, sys.argv[1:])))
     if not is_resumed:
         with open_dict(config):
             config.hydra = settings
@@ -125,7 +125,7 @@ def job(config: DictConfig) -> float | None:
     except Exception as error:
         if not is_expected(error):
             raise
-        sys.exit(" ".join(str(error).split()))
+        sys.exit(printable(" ".join(str(error).split())))
     return None
 
 

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
 from platform import node
 
@@ -23,15 +24,15 @@ _UNFINISHED = re.compile(r"\.(?!evaluation|variations)[\w-]+\.[0-9a-f]{16}\.\w+"
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 
-def paths_below(root: Path, pattern: str) -> list[Path]:
-    """Files and folders below a folder whose names match, sorted.
+def paths_below(root: Path, pattern: str, most: int | None = None) -> list[Path]:
+    """Files and folders below a folder whose names match, sorted; of the ``most`` first folders.
 
     Links to folders are not followed. Folders may disappear during the search, which `Path.rglob`
     does not tolerate.
     """
     return sorted(
         Path(folder, name)
-        for folder, folders, files in os.walk(root)
+        for folder, folders, files in islice(os.walk(root), most)
         for name in (*folders, *files)
         if fnmatchcase(name, pattern)
     )

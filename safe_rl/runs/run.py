@@ -183,7 +183,8 @@ class Run:
         """
         if self.is_run:
             return
-        below = [str(run.directory) for run in find_runs(self.directory)[:5]]
+        # of a home, or of a whole disk, a search would take minutes
+        below = [str(run.directory) for run in find_runs(self.directory, most=1_000)[:5]]
         hint = f" Runs below it: {', '.join(below)}." if below else ""
         raise FileNotFoundError(
             f"{self.directory} is not the folder of a run: no {Run.config_file.name}.{hint}"
@@ -317,9 +318,9 @@ class Run:
         )
 
 
-def find_runs(root: Path) -> list[Run]:
-    """Runs below a folder, itself included, in the order of their paths."""
-    folders = (path.parent for path in paths_below(root, Run.config_file.name))
+def find_runs(root: Path, most: int | None = None) -> list[Run]:
+    """Runs below a folder, itself included, in the order of their paths; see `paths_below`."""
+    folders = (path.parent for path in paths_below(root, Run.config_file.name, most))
     return [Run(folder) for folder in folders if folder.name != Run.notes_folder.name]
 
 

@@ -212,6 +212,20 @@ def test_the_order_of_safety_gymnasium(name, order):
     assert all(map(str.startswith, kinds, order.split()))
 
 
+@pytest.mark.long
+def test_paths_may_have_any_characters(tmp_path):
+    """Umlauts, spaces, brackets and so on, as Python and the command take them in quotes."""
+    folder = tmp_path / "Läufe [1] (ä, b)={c}"
+    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 40, "logger": "none"}
+    first = safe_rl.train("PointGoal1", algo="ppo", directory=folder, record=True, **small)
+    second = safe_rl.train("PointGoal1", algo="ppo", directory=tmp_path / "b", **small,
+                           init_from=folder)  # fmt: skip
+    assert second.table["steps"] == [40]
+    env = make_env("PointGoal1", num_envs=2, seed=0)
+    path = str(first.directory / "transitions").replace("'", "\\'")
+    learned(f"'{path}'", env, "dataset.safe_episodes=false")
+
+
 def test_a_file_without_names_is_used_with_a_warning(tmp_path):
     write_episodes(tmp_path / "data.hdf5", "Battery-v0", 0.5)
     env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"})

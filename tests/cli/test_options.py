@@ -9,7 +9,7 @@ import pytest
 
 from safe_rl.checks import SettingError
 from safe_rl.cli.evaluating import evaluate_run
-from safe_rl.cli.options import OptionError, make_options, read_options, usage
+from safe_rl.cli.options import OptionError, make_options, read_options, run_command, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -89,3 +89,13 @@ def test_an_error_within_a_package_is_not_taken_for_its_absence(tmp_path, monkey
     with pytest.raises(ModuleNotFoundError, match="another_missing_package") as caught:
         import_extra("broken_package", "video")
     assert "extra" not in str(caught.value)
+
+
+def test_an_error_cannot_control_the_terminal(capsys):
+    """Names in checkpoints and robots' files of other people are part of messages."""
+
+    def fail(*arguments):
+        raise ValueError("a robot named \x1b]0;mine\x07")
+
+    assert run_command(fail, ["run"], "safe-rl evaluate RUN", EvaluationOptions) == 1
+    assert capsys.readouterr().err == "error: a robot named ?]0;mine?\n"
