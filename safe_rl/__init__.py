@@ -6,14 +6,29 @@ with. `safe_rl.envs` has the environments, `safe_rl.objectives` the constrained 
 cost accounting.
 """
 
+import os
+import sys
+import warnings
 from typing import TYPE_CHECKING
 
-import safe_rl.processor  # noqa: F401, must precede torch
 from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.cli.python_api import Run, evaluate, load, report, resume, train
     from safe_rl.envs import make_env
+
+# By default idle threads of OpenMP spin for milliseconds after every operation of torch, and take
+# the cores from physics and other programs: of two runs on two cores, each is then ten times
+# slower than one alone. OpenMP reads this when torch is loaded; processes of this one inherit it.
+# GOMP_SPINCOUNT sets the same more finely.
+if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & os.environ.keys():
+    os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    if "torch" in sys.modules:
+        warnings.warn(
+            "torch was imported before safe_rl, so that its idle threads spin and slow down "
+            "everything on these cores: import safe_rl first, or set OMP_WAIT_POLICY=PASSIVE.",
+            stacklevel=2,
+        )
 
 __all__ = ["Run", "evaluate", "load", "make_env", "report", "resume", "train"]
 __version__ = "0.1.0"

@@ -28,7 +28,7 @@ def test_importing_the_package_takes_no_time_and_imports_neither_torch_nor_its_p
     ).splitlines()
     assert float(times) < 0.05
     assert {"Run", "load", "train"} <= set(names.split())
-    assert modules.split() == ["safe_rl", "safe_rl.extras", "safe_rl.processor"]
+    assert modules.split() == ["safe_rl", "safe_rl.extras"]
 
 
 OPENMP_SAYS = {"OMP_DISPLAY_ENV": "verbose"}  # libgomp prints its settings when it is loaded

@@ -84,7 +84,7 @@ def test_partial_nodes_wait_for_their_arguments():
         *("safe_rl.cli.os.system", "safe_rl.collectors.workers.torch.load"),
         *("safe_rl.collectors.workers.signal.raise_signal", "safe_rl.runs.loggers.Path"),
         *("safe_rl.collectors.workers.partial", "safe_rl.collectors.workers.Thread"),
-        *("safe_rl.algorithms.build_part.torch.load", "torch.optim.adam.torch.load"),
+        *("safe_rl.algorithms.minibatch.torch.load", "torch.optim.adam.torch.load"),
         *("torch.optim.lr_scheduler.partial", "torch.optim.adam.Tensor"),
         *("safe_rl.runs.loggers.Path.unlink", "safe_rl.runs.loggers.import_extra"),
         # parts of the package that start programs, import modules, write files and remove them

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from inspect import isclass
 from typing import Any, Protocol, Self
 
 import torch
@@ -20,6 +21,9 @@ from safe_rl.checks import Checked
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import LimitState
 from safe_rl.resumable import Resumable
+from safe_rl.trust import TargetError, locate
+
+_DEFAULT = "safe_rl.algorithms.OnPolicy"
 
 
 class Stateful(Protocol):
@@ -110,6 +114,21 @@ class Algorithm(ABC):
 
     def forget_open_episodes(self) -> None:
         """End the n-step sums of unfinished episodes, because new episodes begin."""
+
+
+def find_algorithm(config: DictConfig) -> type[Algorithm]:
+    """The class that a configuration names as ``algo._target_``; by default `OnPolicy`.
+
+    Raises:
+        TargetError: If there is no such class, or it is not an algorithm.
+    """
+    target = config.algo.get("_target_", _DEFAULT)
+    algorithm = locate(target, "algo._target_")
+    if not (isclass(algorithm) and issubclass(algorithm, Algorithm)):
+        raise TargetError(
+            f"algo._target_={target} is no algorithm: derive it from safe_rl.algorithms.Algorithm."
+        )
+    return algorithm
 
 
 class PolicyUpdate(Checked, Resumable, ABC):

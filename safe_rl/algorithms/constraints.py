@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import torch
+from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from safe_rl.checks import is_number
 from safe_rl.collectors import EpisodeStatistics
@@ -17,6 +20,7 @@ from safe_rl.objectives.limits import LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import PenalisedCosts, RiskMeasure
 from safe_rl.resumable import Resumable
+from safe_rl.trust import instantiate
 
 PENALISED_COSTS = "penalised_costs"
 """Key below ``"next"``, [N, T, k], of what a risk measure puts in place of the costs."""
@@ -74,6 +78,35 @@ class Constraints(Resumable):
         self._finished = torch.full_like(self.limits, torch.nan)
         self._mean_length = torch.full((), torch.nan, device=device)
         self._penalised: PenalisedCosts | None = None
+
+    @classmethod
+    def from_config(cls, config: DictConfig, env: EnvBase, limits: Mapping[str, float]) -> Self:
+        """Build constraints with the tracker and risk measure that a configuration names.
+
+        Lengths of episodes are in decisions (time steps of a batch), schedules in environment
+        steps.
+
+        Args:
+            config: Configuration as composed from ``conf/``.
+            env: Environment that has the costs.
+            limits: Cost key -> d, see `constrained_limits`.
+
+        Raises:
+            ValueError: If a risk measure is named without a tracker.
+        """
+        tracker = risk = None
+        max_length = math.ceil(env.max_episode_steps / env.steps_per_decision)
+        if limits:
+            values = torch.tensor(list(limits.values()))
+            known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
+            risk = instantiate(config.get("risk"), known, cost_limits=values)
+            tracker = instantiate(config.get("limits"), known, cost_limits=values)
+        if risk is not None and tracker is None:
+            raise ValueError(
+                "risk: only the mean cost is limited by the episodes of a batch alone "
+                "(limits=paper); other measures need limits=default."
+            )
+        return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
 
     @property
     def schedule(self) -> str:
@@ -197,6 +230,23 @@ class Constraints(Resumable):
         self.tracker.load_state_dict(state_dict["tracker"])
         if self.risk is not None:
             self.risk.load_state_dict(state_dict["risk"])
+
+
+def constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
+    """Cost limits of a configuration's algorithm; empty if it keeps none.
+
+    Raises:
+        ValueError: If a limit names no cost of the environment, or the algorithm needs a limit.
+    """
+    limits = check_cost_limits(config.cost_limits, env.cost_keys)
+    if not config.algo.constrained:
+        return {}
+    if not limits:
+        raise ValueError(
+            f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
+            "cost_limits='{cost: 25}'. Without constraints use algo=ppo or algo=sac."
+        )
+    return limits
 
 
 def check_cost_limits(

@@ -16,7 +16,6 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
-from safe_rl.algorithms.off_policy_networks import bounded_actions
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import (
     check_steps,
@@ -27,6 +26,7 @@ from safe_rl.collectors import (
     safety_gymnasium_columns,
 )
 from safe_rl.files import read_config
+from safe_rl.models.bounded_actors import bounded_actions
 
 _ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
 

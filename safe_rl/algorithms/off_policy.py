@@ -14,18 +14,20 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
-from safe_rl.algorithms.build_part import build_constraints, build_multiplier, constrained_limits
-from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.constraints import Constraints, constrained_limits
 from safe_rl.algorithms.dataset import fill_replay_buffer
-from safe_rl.algorithms.off_policy_networks import bounded_actions, build_networks, exploring
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import ExploringPolicy
-from safe_rl.objectives import Multiplier
+from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+from safe_rl.models.bounded_actors import bounded_actions
+from safe_rl.models.encoders import TO_FLATTEN, observed_entries
+from safe_rl.objectives import CostValues, MeanCosts, Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
+
+_ON_POLICY_ONLY = ("_target_", "encoders", "memory", "normalise")
 
 
 @dataclass
@@ -77,12 +79,13 @@ class OffPolicy(Resumable, Algorithm):
                 actions must have bounds), or the dataset.
             FileNotFoundError: If there is no such dataset.
         """
-        limits = constrained_limits(config, env, otherwise="sac")
-        device = torch.device(config.device)
+        limits, device = constrained_limits(config, env), torch.device(config.device)
+        constraints = Constraints.from_config(config, env, limits)
+        multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
+        if multiplier is not None:
+            multiplier.to(device)
         cost_values = instantiate(config.critics.get("cost_values"))
         networks = build_networks(config, env, len(limits), device, cost_values)
-        constraints = build_constraints(config, limits, env, device)
-        multiplier = build_multiplier(config, limits, device)
         loss = instantiate(
             config.loss,
             {
@@ -240,3 +243,71 @@ def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
         "single steps and other risk measures need whole episodes. Use risk=mean, algo=wcsac with "
         "risk=cvar, or an on-policy algorithm such as algo=ppo_lagrangian."
     )
+
+
+def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
+    """The exploring policy of an actor, within the bounds of an environment's actions."""
+    spec = bounded_actions(env)
+    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
+
+
+def build_networks(
+    config: DictConfig,
+    env: EnvBase,
+    num_costs: int,
+    device: torch.device,
+    cost_values: CostValues | None = None,
+) -> dict[str, Any]:
+    """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
+
+    Args:
+        config: Configuration as composed from ``conf/``.
+        env: Environment whose specs have the sizes of observations and actions.
+        num_costs: Number of constrained costs; 0: no cost critics.
+        device: Device of the parameters.
+        cost_values: What the cost critics return; by default the mean.
+
+    Raises:
+        ValueError: If actions have no bounds, the observation is not a vector, or the model is for
+            on-policy algorithms only.
+    """
+    model, spec = config.model, bounded_actions(env)
+    cost_values = MeanCosts() if cost_values is None else cost_values
+    size, actions = _observation_size(config, env), len(spec.low)
+    common: dict[str, Any] = {
+        "hidden_sizes": list(model.hidden_sizes),
+        "input_scale": input_scale_vector(model.input_scale, env.observation_layout, size),
+        "device": device,
+    }
+    bounds = {"low": spec.low, "high": spec.high}
+    networks = {"actor": instantiate(config.actor, observation_size=size, **bounds, **common)}
+    if number := config.critics.rewards:
+        networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
+    if num_costs and (number := config.critics.costs):
+        networks["cost_critic"] = QEnsemble(
+            size,
+            actions,
+            num_networks=number * cost_values.networks,
+            num_outputs=num_costs * cost_values.outputs,
+            out_key="cost_state_action_value",
+            **common,
+        )
+    return networks
+
+
+def _observation_size(config: DictConfig, env: EnvBase) -> int:
+    """Length of the observation, one vector; refuses other observations, and on-policy models."""
+    model = config.model
+    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
+        raise ValueError(
+            f"algo={config.algo.name} takes model=mlp only, and model.{others[0]} is for on-policy "
+            "algorithms. Use model=mlp without it."
+        )
+    observed = observed_entries(env.observation_spec)
+    if observed[0].key != "observation" or len(observed[0].shape) != 1:
+        raise ValueError(
+            f"algo={config.algo.name} needs an observation of one vector, and this environment "
+            f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
+            "with model=dict or model=cnn."
+        )
+    return int(observed[0].shape[0])

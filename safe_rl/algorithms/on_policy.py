@@ -19,8 +19,7 @@ from safe_rl.algorithms.algorithm_contract import (
     PolicyUpdate,
     Stateful,
 )
-from safe_rl.algorithms.build_part import build_constraints, build_multiplier, constrained_limits
-from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints
+from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints, constrained_limits
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
@@ -77,14 +76,19 @@ class OnPolicy(Algorithm):
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.
         """
-        limits = _limits(config, env)
-        device = torch.device(config.device)
+        limits, device = constrained_limits(config, env), torch.device(config.device)
+        constraints = Constraints.from_config(config, env, limits)
+        multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
+        if multiplier is not None:
+            multiplier.to(device)
         networks = _build_networks(config, env, len(limits), device)
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
-        constraints = build_constraints(config, limits, env, device)
-        multiplier = build_multiplier(config, limits, device)
         cost_advantage = None
         if limits:
+            if config.get("cost_advantage") is None:
+                raise ValueError(
+                    f"algo={config.algo.name} is constrained and has no cost_advantage."
+                )
             cost_advantage = instantiate(
                 config.cost_advantage,
                 {"cost_limits": constraints.measured_limits},
@@ -175,17 +179,6 @@ class OnPolicy(Algorithm):
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
-    """Limits of the algorithm; refuses limits without an estimator of cost advantages."""
-    limits = constrained_limits(config, env, otherwise="ppo")
-    if limits and config.get("cost_advantage") is None:
-        raise ValueError(
-            f"algo={config.algo.name} is constrained and has no cost_advantage: add that of "
-            "conf/algo/cpo.yaml to its YAML file, or say algo.constrained=false."
-        )
-    return limits
 
 
 def _policy_update(

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from safe_rl.processor import cpuinfo
+from safe_rl.models.networks import cpuinfo
 
 
 def prefers_onednn(cpuinfo: str) -> bool:

@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import CheckpointError
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.envs import ConfigError, ConstrainedEnv, make_env
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
 from safe_rl.files import check_no_links, read_json, replace_json

@@ -11,6 +11,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 from torch.nn.functional import softplus
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
 
 from safe_rl.models.heads import Shape, action_sampler
@@ -153,3 +155,24 @@ class _Squash(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         return self.low + self.reach * (1 + inputs.tanh())
+
+
+def bounded_actions(env: EnvBase) -> TensorSpec:
+    """Spec of one environment's bounded action, [A], in single precision like the networks.
+
+    Raises:
+        ValueError: If actions are not vectors [A] of continuous numbers within finite bounds.
+    """
+    spec = env.action_spec_unbatched
+    is_continuous = isinstance(spec, Bounded) and spec.dtype.is_floating_point
+    if not is_continuous or not (spec.low.isfinite() & spec.high.isfinite()).all():
+        raise ValueError(
+            "Off-policy algorithms need continuous actions within bounds, and this environment's "
+            f"action_spec is {type(spec).__name__}. Use an on-policy one such as ppo_lagrangian."
+        )
+    if len(spec.shape) != 1:
+        raise ValueError(
+            f"An action of this environment has the shape {list(spec.shape)}: policies act by "
+            "vectors [A]. Let the environment take them, and give them their shape itself."
+        )
+    return spec.to(torch.float32)

@@ -6,6 +6,8 @@ Networks share no weights (Ray, Achiam, Amodei 2019, section 5.1).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -16,7 +18,14 @@ from torchrl.modules import MLP
 
 from safe_rl.models.heads import Head, action_sampler, gaussian_head
 from safe_rl.models.input_scales import InputScale
-from safe_rl.processor import cpuinfo
+
+
+@cache
+def cpuinfo() -> str:
+    """Return Linux's description of the processor; an empty text elsewhere."""
+    file = Path("/proc/cpuinfo")
+    return file.read_text() if file.is_file() else ""
+
 
 _MKL_IS_QUICK = torch.backends.mkl.is_available() and "GenuineIntel" in cpuinfo()
 """Whether torch computes the tanh by vector instructions of MKL, which MKL uses in full width on

@@ -18,8 +18,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.algorithm_contract import Algorithm
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import Algorithm, find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv

@@ -5,7 +5,7 @@ import math
 import replay_buffer
 from run_configs import compose_config
 
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.envs import SafetyGymEnv
 

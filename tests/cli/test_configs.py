@@ -10,7 +10,7 @@ from point_mass import PointMass
 from run_configs import CONF, compose_config
 
 from safe_rl.algorithms import OnPolicy
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
 from safe_rl.cli.config import check_settings

@@ -13,7 +13,7 @@ from run_configs import CONF, compose_config
 
 import safe_rl.objectives
 from safe_rl import trust
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.checks import is_setting, parameters_of
 from safe_rl.cli.config import check_settings
 from safe_rl.envs import ConfigError, SafetyGymConfig, resolve

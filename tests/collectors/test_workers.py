@@ -185,7 +185,7 @@ def collect_in_trouble(trouble):
 SCRIPT = """
 import sys
 sys.path[:0] = {path!r}
-import safe_rl.processor
+import safe_rl
 import test_workers
 if __name__ == "__main__":
     test_workers.collect_in_trouble(test_workers.{trouble})

@@ -9,7 +9,7 @@ from commands import run_train
 from point_mass import PointMass  # noqa: F401
 from run_configs import compose_config, without_times
 
-from safe_rl.algorithms.build_part import find_algorithm
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.cli import evaluate
 from safe_rl.collectors import read_dataset
 from safe_rl.envs import make_env
