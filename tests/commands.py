@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from safe_rl.cli import train
 from safe_rl.cli.composing import check_risk, compose_run
-from safe_rl.cli.schema import check_settings
+from safe_rl.cli.config import check_settings
 
 ROOT = Path(__file__).parents[1]
 SMALL = (

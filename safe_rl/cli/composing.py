@@ -20,16 +20,16 @@ from hydra.errors import (
     MissingConfigException,
     OverrideParseException,
 )
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from safe_rl.cli.config import General, keys_of, unknown_key
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF
-from safe_rl.naming import did_you_mean, nearest
-from safe_rl.runs.identity import flatten
+from safe_rl.naming import did_you_mean
 
 _MOST_LISTED = 40
 
@@ -130,6 +130,9 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         return _unknown_key(inner[1] if inner else unknown[1], unknown[1], words)
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
+    absent = re.match(r"Missing mandatory value: (\S+)", str(cause or error))
+    if absent and absent[1] in General.__annotations__:
+        return f"this algorithm has no '{absent[1]}'."
     if cause is not None and str(error) != str(cause):
         return f"{_first_line(error)}: {_first_line(cause)}"
     missing = re.match(r"Missing mandatory value: (\S+)", str(error))
@@ -179,37 +182,13 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     """A message about a key that the configuration does not have."""
     others = [word for word in words if not word.lstrip("+~").startswith((f"{given}=", f"{key}="))]
     try:
-        known = flatten(_plain(_compose(others)))
+        config = _compose(others)
     except (HydraException, OmegaConfBaseException):
-        known = {}
-    if known.get(section := key.partition(".")[0]) == MISSING:  # a key of `General`
+        return unknown_key(key, [])
+    section = key.partition(".")[0]
+    if OmegaConf.is_missing(config, section):
         return f"this algorithm has no '{section}'."
-    meant = [f"'{name}'" for name in nearest_keys(key, list(known))]
-    end = f"Did you mean {' or '.join(meant)}?" if meant else "'--cfg job' prints all keys."
-    return f"there is no key '{key}'. {end}"
-
-
-def _plain(config: DictConfig) -> dict[str, Any]:
-    return {
-        str(key): OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        for key, value in config.items_ex(resolve=False)
-        if key != "hydra"
-    }
-
-
-def nearest_keys(key: str, known: Sequence[str]) -> list[str]:
-    """Known keys that end in the same name, else the most similar one.
-
-    Examples:
-        >>> nearest_keys("lr", ["seed", "policy_update.optimizer.lr"])
-        ['policy_update.optimizer.lr']
-        >>> nearest_keys("env.hazard_num", ["env.hazards_num", "env.vases_num"])
-        ['env.hazards_num']
-    """
-    name = key.rpartition(".")[2]
-    same = [path for path in known if path.rpartition(".")[2] == name]
-    close = nearest(key, known, 0.7)
-    return same or ([close] if close else [])
+    return unknown_key(key, keys_of(config))
 
 
 def check_risk(config: DictConfig) -> None:

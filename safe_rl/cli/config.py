@@ -8,6 +8,7 @@ by the parts' constructors; an environment checks its own.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
@@ -19,7 +20,8 @@ from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, Positi
 from safe_rl.checks import SettingError, Text, check_value, rule
 from safe_rl.evaluation.settings import CertificateOptions, Device
 from safe_rl.extras import require_extra
-from safe_rl.naming import did_you_mean, join_keys
+from safe_rl.naming import join_keys, nearest
+from safe_rl.runs.identity import flatten
 from safe_rl.trust import locate
 
 
@@ -324,7 +326,8 @@ def _check(section: type, values: DictConfig, above: str, *, is_open: bool = Fal
         if name not in hints:
             if is_open or key == "hydra":
                 continue
-            raise SettingError(f"{key}: there is no such key.{did_you_mean(str(name), hints)}")
+            known = [join_keys(above, other) for other in hints] if above else keys_of(values)
+            raise SettingError(unknown_key(key, known))
         kinds = [*filter(_is_section, (hints[name], *get_args(hints[name])))]
         if kinds and value is not None:
             _check(kinds[0], value, key)
@@ -339,3 +342,31 @@ def _check(section: type, values: DictConfig, above: str, *, is_open: bool = Fal
 
 def _is_section(kind: Any) -> bool:
     return isinstance(kind, type) and is_dataclass(kind)
+
+
+def keys_of(config: DictConfig) -> list[str]:
+    """Full keys of all values of a configuration."""
+    plain = {
+        str(key): OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+        for key, value in config.items_ex(resolve=False)
+        if key != "hydra"
+    }
+    return list(flatten(plain))
+
+
+def unknown_key(key: str, known: Iterable[str]) -> str:
+    """A message that a key does not exist; it names keys with the same end, or the nearest one.
+
+    Examples:
+        >>> unknown_key("lr", ["seed", "policy_update.optimizer.lr"])
+        "there is no key 'lr'. Did you mean 'policy_update.optimizer.lr'?"
+        >>> unknown_key("env.hazard_num", ["env.hazards_num", "env.vases_num"])
+        "there is no key 'env.hazard_num'. Did you mean 'env.hazards_num'?"
+    """
+    known = [path for path in known if path != key]
+    same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
+    meant = same or filter(None, [nearest(key, known, 0.7)])
+    names = " or ".join(f"'{path}'" for path in meant)
+    return f"there is no key '{key}'. " + (
+        f"Did you mean {names}?" if names else "'--cfg job' prints all keys."
+    )

@@ -20,10 +20,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
 
 from safe_rl.cli.composing import check_risk, name_choices
-from safe_rl.cli.schema import check_settings
+from safe_rl.cli.config import check_settings
 from safe_rl.cli.user_code import import_modules
 from safe_rl.files import replace_text
-from safe_rl.processes import end_with_parent
 from safe_rl.runs.display import LINE_SECONDS
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.run import Run
@@ -92,6 +91,8 @@ class Summary(Callback):
         """Note that a job has begun; another line follows unless it is interrupted."""
         if config.hydra.mode == RunMode.MULTIRUN:
             if os.getppid() == self._process:
+                from safe_rl.collectors.processes import end_with_parent  # with torch
+
                 # otherwise the job would go on, or wait for ever, after the sweep was killed
                 end_with_parent(_GRACE)
             self._note(config, "interrupted")

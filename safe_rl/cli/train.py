@@ -23,8 +23,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.composing import check_risk, explain, name_choices, overrides_of
+from safe_rl.cli.config import check_settings
 from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
-from safe_rl.cli.schema import check_settings
 from safe_rl.cli.sweeps import run_in_sweep
 from safe_rl.cli.user_code import import_modules, split_imports, take_word
 from safe_rl.envs import store_configs

@@ -15,9 +15,9 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
 from safe_rl.checks import checked
+from safe_rl.collectors.processes import starting_processes
 from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector
 from safe_rl.extras import needs_extra
-from safe_rl.processes import starting_processes
 
 
 def make_collector(

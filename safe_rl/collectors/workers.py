@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from safe_rl.processes import leave_signals_to_parent
+from safe_rl.collectors.processes import leave_signals_to_parent
 
 
 class MakeEnv(Protocol):

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from safe_rl.processes import starting_processes
+from safe_rl.collectors.processes import starting_processes
 
 pytestmark = pytest.mark.long
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 # a parent that starts a child, which says when it watches and when it gets SIGTERM
 PARENT = """
@@ -22,7 +22,7 @@ time.sleep(600)
 """
 CHILD = """
 import os, signal, sys, time
-from safe_rl.processes import end_with_parent
+from safe_rl.collectors.processes import end_with_parent
 signal.signal(signal.SIGTERM, lambda *_: print("told", flush=True))
 end_with_parent({grace})
 end_with_parent({grace})
@@ -50,7 +50,7 @@ def test_a_child_ends_soon_after_its_parent(ending, grace, last_words):
 DEAF = """
 import sys, time
 sys.stdin.readline()
-from safe_rl.processes import leave_signals_to_parent
+from safe_rl.collectors.processes import leave_signals_to_parent
 leave_signals_to_parent()
 print("begun", flush=True)
 time.sleep(600)

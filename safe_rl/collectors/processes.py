@@ -1,7 +1,4 @@
-"""Child processes that end with their parent, and leave signals to it.
-
-This is directly in ``safe_rl/``, because sweeps, collectors and environments start processes.
-"""
+"""Child processes that end with their parent, and leave signals to it."""
 
 from __future__ import annotations
 
