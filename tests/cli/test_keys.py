@@ -113,7 +113,7 @@ def test_no_value_ends_in_a_traceback():
         (
             "model.hiden_sizes",
             [64],
-            "model.hiden_sizes: there is no such key. Did you mean 'hidden",
+            "key 'model.hiden_sizes'. Did you mean 'model.hidden_sizes'?",
         ),
         ("certificate.cap", 25, "certificate.cap=25: it must be above every limit of"),
         ("collector.num_collectors", 4, "use collector=process or collector=ray"),
