@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 from annotated_types import Interval
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from safe_rl.checks import SettingError, Text, check_value, rule
@@ -279,6 +280,14 @@ def check_settings(config: DictConfig) -> None:
     Raises:
         SettingError: For a key that does not exist or is out of range; the message names it.
     """
+    try:
+        _check_all(config)
+    except OmegaConfBaseException as error:  # such as an interpolation of a key that is not there
+        line = str(error).partition("\n")[0]
+        raise SettingError(f"{error.full_key}: {line}") from None
+
+
+def _check_all(config: DictConfig) -> None:
     with open_dict(config):
         for name in [key for key in config if OmegaConf.is_missing(config, key)]:
             del config[name]

@@ -39,9 +39,9 @@ WRONG = {
 }
 MINE = """
 # @package _global_
-mine: {tail: 0.25, weight: 1.0}
+algo: {tail: 0.25, weight: 1.0}  # keys of its own
 lagrangian:
-  init: ${mine.tail}
+  init: ${algo.tail}
 """
 
 
@@ -99,14 +99,14 @@ def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
     (tmp_path / "algo" / "mine.yaml").write_text(text)
     (tmp_path / "env" / "Nearby.yaml").write_text("defaults: [PointGoal1]\nhazards_num: 3\n")
     folder = f"{flag}{tmp_path}{']' if '[' in flag else ''}"
-    (config,) = composed(folder, "algo=mine", "env=Nearby", "mine.tail=0.1")
+    (config,) = composed(folder, "algo=mine", "env=Nearby", "algo.tail=0.1")
     assert (config.algo.name, config.env.hazards_num, config.lagrangian.init) == ("mine", 3, 0.1)
     for wrong, meant in {
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",
-        "mine.tial=1": "Did you mean 'mine.tail'",
+        "algo.tial=1": "Did you mean 'algo.tail'",
     }.items():
-        choice = [] if wrong.startswith("algo") else ["algo=mine"]
+        choice = [] if wrong.startswith("algo=") else ["algo=mine"]
         with pytest.raises(ValueError, match=meant):
             composed(folder, *choice, wrong)
 
