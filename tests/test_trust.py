@@ -88,7 +88,7 @@ def test_partial_nodes_wait_for_their_arguments():
         *("torch.optim.lr_scheduler.partial", "torch.optim.adam.Tensor"),
         *("safe_rl.runs.loggers.Path.unlink", "safe_rl.runs.loggers.import_extra"),
         # parts of the package that start programs, import modules, write files and remove them
-        *("safe_rl.envs.gymnasium.FloatCosts", "safe_rl.envs.from_gymnasium"),
+        *("safe_rl.envs.gymnasium.CheckedSteps", "safe_rl.envs.from_gymnasium"),
         *("safe_rl.collectors.StepRecorder", "safe_rl.collectors.recording.Recording"),
         "safe_rl.envs.gymnasium.from_gymnasium",
         "safe_rl.algorithms.dataset.read_dataset",

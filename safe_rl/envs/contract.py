@@ -64,6 +64,9 @@ class ConstrainedEnv(EnvBase):
     steps_before: int = 0
     first_steps: Tensor | None = None
     render: Any = None
+    #: Whether `_step` and `_reset` may return the tensors of an earlier call, as environments of
+    #: users may; then what they return is copied.
+    reuses_tensors: bool = True
 
     @property
     def action_bounds(self) -> tuple[Tensor, Tensor] | None:
@@ -123,6 +126,7 @@ class ConstrainedEnv(EnvBase):
     def reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         """Begin episodes as `EnvBase.reset` does, at first those after `first_steps`."""
         begun = super().reset(tensordict, **kwargs)
+        begun = begun.clone() if self.reuses_tensors else begun
         if self.first_steps is not None:
             steps, self.first_steps = self.first_steps, None
             begun.update(self.add_steps(steps))
@@ -157,7 +161,8 @@ class ConstrainedEnv(EnvBase):
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         try:
-            return super()._step_proc_data(next_tensordict_out)
+            checked = super()._step_proc_data(next_tensordict_out)
+            return checked.clone() if self.reuses_tensors else checked
         except (AttributeError, RuntimeError) as error:
             written = {key: next_tensordict_out.get(key, None) for key in self.reward_keys}
             shapes = {key: None if v is None else list(v.shape) for key, v in written.items()}

@@ -31,6 +31,7 @@ class SimulatedEnv(ConstrainedEnv):
         num_threads: Threads that step the physics; 0 for one per core.
     """
 
+    reuses_tensors = False
     #: Flags of a step, all of them False after a reset.
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Default camera of pictures.

@@ -48,6 +48,23 @@ def test_a_step_without_its_cost_or_with_another_shape_is_named(cost, shape):
         Wrong(2).rollout(1)
 
 
+def test_an_environment_may_return_the_same_tensors_at_every_step():
+    class Reusing(PointMass):
+        def _step(self, tensordict):
+            step = super()._step(tensordict)
+            self.kept = step if not hasattr(self, "kept") else self.kept.update_(step)
+            return self.kept.copy()
+
+    rollouts = []
+    for kind in (PointMass, Reusing):
+        torch.manual_seed(0)
+        env = kind(2)
+        env.set_seed(0)
+        rollouts.append(env.rollout(5)["next", "observation"])
+    assert torch.equal(*rollouts)
+    assert not torch.equal(rollouts[1][:, 0], rollouts[1][:, -1])
+
+
 def test_other_kinds_are_told_what_to_be():
     with pytest.raises(ContractError, match="not a TorchRL environment"):
         check_constrained_env(object())

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import os
 
 import mujoco
 import numpy as np
@@ -11,6 +12,8 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.extending import register_robot
+
+pytestmark = pytest.mark.filterwarnings("ignore:The keyframes of")
 
 # A planar disc with an arm on a hinge; the turning motor has no control range of its own.
 DISC = """
@@ -252,6 +255,20 @@ def test_robots_with_other_masks_stand_on_the_floor_and_touch_objects(make, mask
     assert heights["robot"].min() > 0.1
     assert heights["vases"].min() > 0.09
     assert rollout["next", "cost_pillars"][:, 0].all()
+
+
+def test_keyframes_and_ranges_without_0_are_told(make):
+    with pytest.warns(UserWarning, match="keyframes of .* are not used"):
+        make(BALL)
+    with pytest.warns(UserWarning, match="action 0 is outside the control range"):
+        make(changed(DISC, 'ctrlrange="-0.5 2"', 'ctrlrange="0.5 2"'))
+
+
+def test_a_pipe_among_the_included_files_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.xml")
+    (tmp_path / "robot.xml").write_text('<mujoco><include file="pipe.xml"/></mujoco>')
+    with pytest.raises(ConfigError, match=r"pipe.xml is no regular file"):
+        SafetyGymEnv({"robot_base": str(tmp_path / "robot.xml")})
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,9 @@ WRONG_CONFIGS = {
     "no speed": ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
     "two starts": ({"robot_locations": [[0, 0], [1, 1]]}, "'robot_locations' has 2 .* for 1 obj"),
     "no hazards": ({"hazards_locations": [[0, 0]]}, "'hazards_locations' has 1 .* for 0 objects"),
+    "idle boundary": ({"boundary_x": 1.0}, "'boundary_x' has no effect.*'constrain_boundary'"),
+    "idle limit": ({"velocity_limit": 1.0}, "'velocity_limit' has no effect.*'constrain_vel"),
+    "idle seeds": ({"layout_seeds_first": 5}, "'layout_seeds_first' has no effect.*'layout_seeds'"),
     "no vases": ({"constrain_vases": True}, "'constrain_vases' has no effect.*'vases_num' is 0"),
 }
 
@@ -120,6 +123,25 @@ WRONG_CONFIGS = {
 def test_wrong_configurations(values, message):
     with pytest.raises((ConfigError, UserWarning), match=message):
         SafetyGymEnv({"robot_base": "point", **values}, num_threads=1)
+
+
+def test_failing_physics_is_told_once_and_ends_what_always_fails(capfd):
+    env = make("PointGoal0")
+    tensordict = env.reset()
+    nothing = torch.full((NUM_ENVS, 2), math.nan)
+
+    def steps():
+        after = tensordict
+        for _ in range(20):
+            after = env.step_and_maybe_reset(after.set("action", nothing))[1]
+
+    with (
+        pytest.warns(RuntimeWarning, match="of 4 of 4 simulations failed") as told,
+        pytest.raises(RuntimeError, match="all simulations failed in 10 steps in a row"),
+    ):
+        steps()
+    assert len(told) == 1
+    assert "WARNING" not in "".join(capfd.readouterr())
 
 
 WRONG_STATES = {

@@ -83,8 +83,51 @@ def paying(*costs):
 @pytest.mark.parametrize("cost", [np.ones(3), "hot", None])
 def test_a_cost_that_is_no_number_is_told_with_its_name(cost):
     env = from_gymnasium(paying(cost), num_envs=2, num_steps=4, cost_keys=["cost"], seed=3)
-    with pytest.raises(ConfigError, match=r"info\['cost'\] must be one number per step"):
+    with pytest.raises(ConfigError, match=r"info\['cost'\] must be one number"):
         env.rollout(2)
+
+
+WRONG_STEPS = {
+    "shape": (
+        {0: {"count": 1, "length": np.zeros(2)}},
+        r"\['length'\] must be numbers of",
+    ),
+    "nothing": ({0: None}, "observation must be a dictionary with 'count'.*step 1 .*NoneType"),
+    "text": ({0: {"count": 1, "length": "far"}}, r"\['length'\] must be numbers.*'far'"),
+    "rewards": ({1: np.ones(3)}, r"the reward must be one number, but step 1 .*\(3,\)"),
+    "no info": ({4: None}, "info must be a dictionary, but step 1"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), WRONG_STEPS.values(), ids=WRONG_STEPS)
+def test_what_a_step_must_not_return_is_told_with_entry_shape_and_step(changes, message):
+    class Wrong(Counter):
+        def step(self, action):
+            return tuple(changes.get(i, part) for i, part in enumerate(super().step(action)))
+
+    env = from_gymnasium(Wrong, num_envs=2, num_steps=4, cost_keys=["cost"], seed=3)
+    with pytest.raises(ConfigError, match=message):
+        env.rollout(2)
+
+
+def test_a_cost_that_comes_late_and_is_not_counted_is_told():
+    class Late(Counter):
+        def step(self, action):
+            *values, info = super().step(action)
+            return *values, info | ({"cost_b": 1.0} if self.count == 3 else {})
+
+    env = from_gymnasium(Late, num_envs=1, num_steps=6, seed=5)
+    with pytest.warns(UserWarning, match=r"info\['cost_b'\] of step 3 is not counted.*cost,cost_l"):
+        env.rollout(4)
+
+
+@pytest.mark.parametrize("name", ["a.b", "graph"])
+def test_observations_that_have_no_name_or_no_array_are_refused(name):
+    box = Box(0, 1, (1,))
+    space = gymnasium.spaces.Graph(box, None) if name == "graph" else box
+    wrong = type("Wrong", (Counter,), {"observation_space": gymnasium.spaces.Dict({name: space})})
+    with pytest.raises(ConfigError, match="rename it" if name == "a.b" else "cannot become"):
+        from_gymnasium(wrong, cost_keys=["cost"], num_steps=3)
 
 
 def test_costs_of_rows_may_be_of_different_types():

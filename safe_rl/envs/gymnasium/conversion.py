@@ -74,7 +74,24 @@ def from_gymnasium(
     require_integer("num_envs", num_envs, lowest=1)
     make = _maker(env, kwargs, num_steps)
     keys, length = _describe(make, cost_keys, num_steps, outside)
-    make_one = partial(make_adapted, make, length, flatten, keys)
+    settings = (num_envs, keys, length, outside, flatten, seed, device)
+    return _batch(make, *settings, watch=cost_keys is None)
+
+
+def _batch(
+    make: MakeEnv,
+    num_envs: int,
+    keys: list[str],
+    length: int,
+    outside: Any,
+    flatten: bool,
+    seed: int | None,
+    device: torch.device | str,
+    *,
+    watch: bool,
+) -> GymnasiumEnv:
+    """Make N environments; with `watch`, there is a warning about costs that are not counted."""
+    make_one = partial(make_adapted, make, length, flatten, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
@@ -158,15 +175,17 @@ def _make_node(
     config = complete_foreign(FOREIGN[family], config)
     make = maker(config)
     try:
-        return from_gymnasium(
+        require_integer("num_envs", num_envs, lowest=1)
+        return _batch(
             make,
-            num_envs=num_envs,
-            cost_keys=config["cost_keys"],
-            outside=config.get("outside"),
-            num_steps=config["num_steps"],
-            seed=None if seed is None else spread_seed(seed),
-            flatten=config.get("flatten", True),
-            device=device,
+            num_envs,
+            [*dict.fromkeys(config["cost_keys"])],
+            config["num_steps"],
+            config.get("outside"),
+            config.get("flatten", True),
+            None if seed is None else spread_seed(seed),
+            device,
+            watch=True,
         )
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error

@@ -13,13 +13,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium import spaces
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from safe_rl.envs.costs import COST
+from safe_rl.envs.costs import COST, is_cost
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.pictures import resize
 from safe_rl.envs.torchrl.torchrl_env import TorchRLEnv
@@ -29,14 +30,19 @@ COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
 def make_adapted(
-    make: Callable[[], gymnasium.Env], num_steps: int, flatten: bool, cost_keys: Sequence[str]
+    make: Callable[[], gymnasium.Env],
+    num_steps: int,
+    flatten: bool,
+    cost_keys: Sequence[str],
+    watch: bool = False,
 ) -> gymnasium.Env:
     """Make an environment whose choices start at 0 and whose costs in `info` are floats.
 
     Episodes are truncated after `num_steps`. With `flatten`, observations are float32 vectors.
     """
-    env: gymnasium.Env = FloatCosts(make(), cost_keys)
+    env: gymnasium.Env = CheckedSteps(make(), cost_keys, watch)
     seen, actions = env.observation_space, env.action_space
+    _check_space(seen, flatten)
     if not isinstance(actions, Box | Discrete | MultiDiscrete | MultiBinary):
         raise ConfigError(
             "The algorithms need actions that are continuous and bounded (a Box) or choices "
@@ -44,7 +50,7 @@ def make_adapted(
         )
     # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled.
     if flatten:
-        space = Box(-np.inf, np.inf, (gymnasium.spaces.flatdim(seen),), np.float32)
+        space = Box(-np.inf, np.inf, (spaces.flatdim(seen),), np.float32)
         env = TransformObservation(env, partial(_vector, seen), space)
     if isinstance(actions, Discrete | MultiDiscrete) and np.any(actions.start):
         choices = (
@@ -54,39 +60,97 @@ def make_adapted(
     return TimeLimit(env, num_steps)
 
 
+def _check_space(space: gymnasium.Space, flatten: bool) -> None:
+    if isinstance(space, spaces.Dict):
+        for key, inner in space.items():
+            if "." in key:
+                raise ConfigError(
+                    f"The observation has an entry '{key}': rename it, because dots stand between "
+                    "the names of nested entries."
+                )
+            _check_space(inner, flatten)
+    elif isinstance(space, spaces.Graph | spaces.Sequence | spaces.Text):
+        raise ConfigError(f"The observation has a {space}, which cannot become an array.")
+    elif isinstance(space, spaces.Tuple) and not flatten:
+        raise ConfigError("The observation is a Tuple: set flatten=true, which makes one vector.")
+
+
 def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
-    return np.asarray(gymnasium.spaces.flatten(space, observation)).astype(np.float32)
+    return np.asarray(spaces.flatten(space, observation)).astype(np.float32)
 
 
-class FloatCosts(gymnasium.Wrapper):
-    """Converts the costs in `info` to floats.
+class CheckedSteps(gymnasium.Wrapper):
+    """Checks what an environment returns, and converts the costs in `info` to floats.
 
-    It raises a ConfigError if one is not a number, or if a step does not return five values.
     Gymnasium puts the costs of a batch into an array of the first row's type. If this is an
     integer, it rounds the costs of the other rows.
+
+    Raises:
+        ConfigError: At a reset or step that returns something else than the environment's spaces
+            say; the message names the entry, its shape and the step.
     """
 
-    def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str]) -> None:
+    def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str], watch: bool) -> None:
         super().__init__(env)
-        self._cost_keys = list(cost_keys)
+        self._cost_keys, self._step, self._watch = list(cost_keys), 0, watch
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Reset, and check what is returned."""
+        self._step = 0
+        observation, info = self.env.reset(**kwargs)
+        self._check("observation", self.observation_space, observation)
+        return observation, {} if info is None else info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, and convert the costs."""
+        """Step, check what is returned, and convert the costs."""
+        self._step += 1
         *values, info = self.env.step(action)
         if len(values) != 4:
             raise ConfigError(
                 f"A step of {self.env} returned {len(values) + 1} values instead of five. If its "
                 "cost is one of six values, use from_six_values."
             )
-        costs = {key: info[key] for key in self._cost_keys if key in info}
-        for key, cost in costs.items():
-            try:
-                costs[key] = float(cost)
-            except (TypeError, ValueError):
-                raise ConfigError(
-                    f"info['{key}'] must be one number per step, as it is a cost; got {cost!r}."
-                ) from None
-        return *values, {**info, **costs}
+        if not isinstance(info, dict):
+            raise self._wrong("info", "a dictionary", info)
+        self._check("observation", self.observation_space, values[0])
+        costs = {key: self._number(f"info['{key}']", info[key]) for key in self._costs_of(info)}
+        return values[0], self._number("the reward", values[1]), *values[2:], {**info, **costs}
+
+    def _costs_of(self, info: dict[str, Any]) -> list[str]:
+        """Names of the costs in `info`; one warning about those that are not counted."""
+        uncounted = [key for key in info if is_cost(key) and key not in self._cost_keys]
+        if uncounted and self._watch:
+            self._watch = False
+            warnings.warn(
+                f"info['{uncounted[0]}'] of step {self._step} is not counted as a cost, because it "
+                f"is not in env.cost_keys=[{','.join(self._cost_keys)}].",
+                stacklevel=2,
+            )
+        return [key for key in self._cost_keys if key in info]
+
+    def _check(self, name: str, space: gymnasium.Space, value: Any) -> None:
+        if isinstance(space, spaces.Dict):
+            for key, inner in space.items():
+                if not isinstance(value, Mapping) or key not in value:
+                    raise self._wrong(name, f"a dictionary with '{key}'", value)
+                self._check(f"{name}['{key}']", inner, value[key])
+        elif isinstance(space, Box | MultiBinary | MultiDiscrete):
+            array = np.asarray(value)
+            if array.shape != space.shape or array.dtype.kind not in "fiub":
+                raise self._wrong(name, f"numbers of the shape {space.shape}", value)
+
+    def _number(self, name: str, value: Any) -> float:
+        try:
+            return float(value)
+        except (TypeError, ValueError):
+            raise self._wrong(name, "one number", value) from None
+
+    def _wrong(self, name: str, wanted: str, value: Any) -> ConfigError:
+        shape = getattr(value, "shape", None)
+        got = f"a {type(value).__name__}" + (f" of the shape {shape}" if shape else f", {value!r}")
+        return ConfigError(
+            f"{self.unwrapped}: {name} must be {wanted}, but step {self._step} returned {got:.200}."
+        )
 
 
 class SixValues(gymnasium.Wrapper):

@@ -11,6 +11,8 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
+import warnings
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,11 +40,25 @@ def robot_files(path: Path) -> list[Path]:
     Raises:
         ConfigError: If one cannot be read.
     """
+    _check_files(path, path.parent)
     try:
         named = mujoco.mju_getXMLDependencies(str(path))
     except mujoco.FatalError as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
     return [file for file in map(Path, named) if file.is_file()]
+
+
+def _check_files(path: Path, folder: Path) -> None:
+    """Refuse a file, or one that it includes, that MuJoCo would wait for, such as a pipe."""
+    if path.exists() and not path.is_file():
+        raise ConfigError(f"'robot_base': {path} is no regular file.")
+    try:
+        included = ElementTree.parse(path).iter("include") if path.is_file() else ()
+    except ElementTree.ParseError:  # MuJoCo says what is wrong
+        return
+    for node in included:
+        if (other := folder / node.get("file", "")) != path:
+            _check_files(other, folder)
 
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators without a range in the file
@@ -81,6 +97,11 @@ def load_robot(base: str) -> Robot:
     path = robot_path(base)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
+        if spec.keys:
+            warnings.warn(
+                f"The keyframes of {path} are not used: joints begin an episode at 0, or at 'ref'.",
+                stacklevel=2,
+            )
         for key in list(spec.keys):
             spec.delete(key)  # a pose of the robot alone does not fit the world
         compiled = spec.copy()
@@ -92,6 +113,13 @@ def load_robot(base: str) -> Robot:
     bounded = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
     if bounded or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1]:
         spec = _with_masses_of(compiled, model)
+    low, high = model.actuator_ctrlrange[model.actuator_ctrllimited.astype(bool)].T
+    if (low > 0).any() or (high < 0).any():
+        warnings.warn(
+            f"{path}: action 0 is outside the control range of an actuator, and is clipped to it. "
+            "Policies begin with actions around 0: shift the range by the actuator's parameters.",
+            stacklevel=2,
+        )
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
             actuator.ctrlrange, actuator.ctrllimited = CONTROL_RANGE, True

@@ -127,6 +127,13 @@ EXTRAS: dict[str, Values] = _DEBUG_SUITE | {
 }
 
 
+# Keys that have no effect without another one.
+_NEEDED = {
+    **{"boundary_x": "constrain_boundary", "boundary_y": "constrain_boundary"},
+    **{"velocity_limit": "constrain_velocity", "layout_seeds_first": "layout_seeds"},
+}
+
+
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     """Return the checked configuration of a name, a mapping of keys, or a configuration.
 
@@ -193,6 +200,9 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
     if config.constrain_velocity and config.velocity_limit is None:
         raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
+    for name, needed in _NEEDED.items():
+        if getattr(config, name) and not getattr(config, needed):
+            warnings.warn(f"'{name}' has no effect: set '{needed}' too.", stacklevel=2)
     keys = config.to_dict()
     for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
         pinned, number = len(keys.get(f"{kind}_locations", ())), keys.get(f"{kind}_num", 1)

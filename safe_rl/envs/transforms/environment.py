@@ -40,6 +40,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self._ours = {n: t for n, t in transforms.items() if isinstance(t, ConstraintTransform)}
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
+        self.reuses_tensors = base_env.reuses_tensors
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours.items():
             try:
