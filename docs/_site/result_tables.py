@@ -48,8 +48,8 @@ Rows = list[dict[str, Any]]
 @cache
 def runs(campaign: str) -> pandas.DataFrame:
     """Runs of a campaign: environment, algorithm, name of the setting or "", seed, and the run."""
-    found = []
-    for path, run in read_archive(ROOT / "results" / campaign).items():
+    found, folder = [], ROOT / "results" / campaign
+    for path, run in (read_archive(folder) if folder.is_dir() else {}).items():
         env, *names, seed = path.split("/")
         algo = run.config["algo"]["name"]
         name = "/".join(name for name in names if name != algo)
@@ -154,7 +154,7 @@ def table(rows: Iterable[Mapping[str, Any]], *columns: str) -> str:
 def held_out() -> str:
     """Constrained algorithms on held-out seeds after three million steps."""
     ends = ("cost", "return", "since", "above", "rate", "certified", "new")
-    rows = summaries("held_out", MILLION / 2, MILLION)
+    rows = summaries("held_out", MILLION / 2, MILLION) + summaries("eighteen", MILLION / 2, MILLION)
     return table(rows, "environment", "algorithm", "seeds", *ends)
 
 
@@ -249,6 +249,7 @@ def velocity_runs() -> str:
 def coverage() -> str:
     """Which environments of the benchmark have runs: number of seeds, by algorithm and length."""
     campaigns = {"algorithms": "defaults, 1M steps", "held_out": "defaults, 3M"}
+    campaigns |= {"eighteen": "defaults, 3M"}
     campaigns |= {"reference": "defaults, 3M", "held_actions": "hard_tasks"}
     campaigns |= {"paper_preset": "paper's settings", "doggo": "other"}
     found = pandas.concat([runs(name).assign(what=what) for name, what in campaigns.items()])

@@ -151,3 +151,26 @@ def test_the_two_runs_on_a_gpu():
     for seed in ("0", "1321"):
         end = re.search(rf"\| {seed} \|.*\| ([≤\d. at]+) \|$", table, re.MULTILINE)[1]
         assert end in page
+
+
+def test_readme_says_of_how_many_environments_there_are_results():
+    rows = results.coverage().splitlines()[2:]
+    assert len(rows) == 18
+    count = sum("(" in row for row in rows)
+    words = (
+        "",
+        "",
+        "",
+        "",
+        "",
+        "",
+        "six",
+        "seven",
+        "eight",
+        "nine",
+        "ten",
+        "eleven",
+        "twelve",
+        "thirteen",
+    )
+    assert f"eighteen environments [{words[count]} have results so far]" in said("README.md")
