@@ -37,6 +37,7 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
+    from safe_rl.evaluation.policies import writable_copy
     from safe_rl.training.train import certify_run
 
     names = ("certify", "certificate", "deterministic", "num_threads")
@@ -49,7 +50,7 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
                 "deterministic=true and num_threads=…"
             )
     certificate = certify_run(
-        directory,
+        writable_copy(directory),
         num_threads=options.num_threads,
         changes=options.certificate,
         deterministic=options.deterministic,

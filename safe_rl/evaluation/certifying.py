@@ -163,10 +163,13 @@ def _costs(*parts: Episodes) -> dict[str, np.ndarray]:
 
 
 def _candidates(run: Run) -> list[Path]:
-    """Checkpoints, best and last ones, by ascending steps, one for every number of steps."""
+    """Checkpoints, best and last ones, by ascending steps, one for every number of steps.
+
+    An exported policy has none of these kinds, only its certified one.
+    """
     kinds = (run.checkpoints(kind) for kind in ("best", "last"))
     found = {path.name: path for paths in kinds for path in paths}
-    return [found[name] for name in sorted(found)]
+    return [found[name] for name in sorted(found)] or run.checkpoints("certified")
 
 
 def _has_warp(trial: Trial) -> bool:
@@ -234,6 +237,8 @@ def _keep(run: Run, checkpoint: Path | None) -> Path | None:
     """
     directory = run.checkpoints_folder / "certified"
     if checkpoint is None:
+        if directory.is_dir() and not (run.checkpoints("best") or run.checkpoints("last")):
+            directory.rename(directory.with_name("last"))  # an exported policy's only weights
         shutil.rmtree(directory, ignore_errors=True)
         return None
     directory.mkdir(parents=True, exist_ok=True)

@@ -15,6 +15,7 @@ from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify, certifying
 from safe_rl.evaluation.certifying import _RANKING, _TEST, _run, _write
 from safe_rl.evaluation.measuring import Trial
+from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.reporting.tables import read_certificate
 from safe_rl.runs.run import Run
@@ -179,6 +180,19 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
     assert not json.loads((directory / "certificate.json").read_text())["certified"]
     with pytest.raises(FileNotFoundError):
         Run(directory).find_checkpoint("certified")
+
+
+def test_an_exported_policy_is_certified_anew_and_keeps_its_weights(train, tmp_path):
+    run, folder = train("{cost: 19}"), tmp_path / "policy"
+    certify(run, OPTIONS, make_env=make_env)
+    weights = pack_policy(run, folder)
+    mean = certify(folder, replace(OPTIONS, deterministic=True), make_env=make_env)
+    assert mean.checkpoint == weights
+    strict = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=0.0)
+    assert certify(folder, strict, make_env=make_env).checkpoint is None
+    assert Run(folder).find_checkpoint("last").name == weights.name
+    with pytest.raises(FileNotFoundError):
+        Run(folder).find_checkpoint("certified")
 
 
 def test_without_limits_there_is_nothing_to_certify(train):
