@@ -137,56 +137,6 @@ class EpisodeLengths(Resumable):
         return torch.tensor(min(steps / ends, self.longest) if early else float(self.longest))
 
 
-class NoiseCorrelation(Resumable):
-    """Correlation of the noise in the costs of successive batches, measured from their rows.
-
-    An episode that spans several batches keeps its layout. So a row with a high cost in one batch
-    is likely to have a high cost in the next. Rows are independent of each other. Therefore the
-    correlation of their deviations from the batch's mean is also the correlation of the noise of
-    the means. A change of the policy shifts all rows alike, which has no effect on the deviations.
-    The correlation begins as 0, with the weight of one batch.
-
-    Args:
-        memory: Weight in [0, 1) of the past.
-        largest: Upper bound, below 1; with 0, batches count as independent.
-
-    Examples:
-        >>> noise = NoiseCorrelation(memory=0.9, largest=0.6)
-        >>> for _ in range(30):  # the rows never change
-        ...     noise.update(torch.tensor([[0.0], [1.0]]))
-        >>> noise.correlation, noise.variance_factor
-        (tensor([0.6000]), tensor([4.0000]))
-    """
-
-    state_names = ("_rows", "_products")
-
-    def __init__(self, *, memory: float, largest: float) -> None:
-        self.memory, self.largest = memory, largest
-        self._rows, self._products = torch.zeros(0, 1), torch.zeros(2, 1)
-
-    @property
-    def correlation(self) -> Tensor:
-        """From 0 to the largest, [k]."""
-        shared, whole = self._products
-        return torch.where(whole > 0, shared / whole, 0.0).clamp(0.0, self.largest)
-
-    @property
-    def variance_factor(self) -> Tensor:
-        """(1 + r) / (1 − r), [k]: factor of the variance of a mean over many batches."""
-        return (1 + self.correlation) / (1 - self.correlation)
-
-    def update(self, rates: Tensor) -> None:
-        """Update the correlation with the mean cost per step of every row of a batch, [N, k]."""
-        last, present = self._rows, rates - rates.mean(0)
-        self._rows = present
-        if last.shape != present.shape:
-            self._products = torch.stack([torch.zeros_like(rates[0]), present.square().mean(0)])
-            return
-        whole = (last.square() + present.square()).mean(0) / 2
-        seen = torch.stack([(last * present).mean(0), whole])
-        self._products = torch.lerp(seen, self._products, self.memory)
-
-
 class EpisodeCosts(Resumable):
     """Estimator of J_c, of the mean episode length T̄ and of the size of one cost, over a run.
 
@@ -198,8 +148,6 @@ class EpisodeCosts(Resumable):
         memory: Weight in [0, 1) of the past in the estimated variance of costs.
         smallest: Costs per step, of size `unit`. The drift is relative to J_c, or to the J_c of
             this many costs if it is larger. Otherwise an estimate of 0 could never change again.
-        largest_correlation: Upper bound of the correlation of successive batches, which makes
-            standard errors larger; see `NoiseCorrelation`.
 
     Examples:
         >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
@@ -209,7 +157,7 @@ class EpisodeCosts(Resumable):
         tensor([20.])
     """
 
-    state_names = ("_mean", "_error", "_sums", "_scatter", "lengths", "noise")
+    state_names = ("_mean", "_error", "_sums", "_scatter", "lengths")
 
     def __init__(
         self,
@@ -219,11 +167,9 @@ class EpisodeCosts(Resumable):
         drift: float | None,
         memory: float,
         smallest: float = 0.0,
-        largest_correlation: float = 0.0,
     ) -> None:
         self.drift, self.memory, self.smallest = drift, memory, smallest
         self.lengths = EpisodeLengths(max_length)
-        self.noise = NoiseCorrelation(memory=memory, largest=largest_correlation)
         self._mean, self._error = torch.full((2, num_costs), torch.nan)
         #: The estimate from the last batch alone.
         self.batch = self.estimate
@@ -260,9 +206,8 @@ class EpisodeCosts(Resumable):
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         limited = costs if penalised is None else penalised.costs.to(costs)
-        self.noise.update(limited.mean(1).float())
         mean, error = (part.float() for part in rate_estimate(limited, self.length))
-        batch = CostEstimate(mean, error * self.noise.variance_factor.sqrt())
+        batch = CostEstimate(mean, error)
         if penalised is not None:
             batch = batch._replace(mean=batch.mean + penalised.offset)
         self.batch = batch

@@ -91,8 +91,6 @@ class LimitTracker(Checked, Resumable):
         largest_margin: Upper bound of the margin, as a share of d.
         free_steps: Environment steps at the start during which costs have no effect.
         descent_steps: Environment steps, after free_steps, during which the limit falls to d.
-        recovery: Share of d that becomes the target when J_c exceeds d. It stays the target until
-            J_c has fallen to it. 1: the target stays d. C-TRPO's step has such a hysteresis itself.
         steps_per_decision: Environment steps per time step of a batch, which is one action.
         frames: Environment steps of the whole run.
         latest_end: Share of the run at which the descent ends at the latest. In a shorter run,
@@ -101,13 +99,6 @@ class LimitTracker(Checked, Resumable):
         drift: Expected relative change of J_c per update, see `EpisodeCosts`; None uses each batch
             alone.
         memory: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
-        largest_correlation: Upper bound of the correlation r of the noise of successive batches;
-            with 0, batches count as independent. r is measured from rows whose episodes span
-            batches. The variance of a batch's J_c, estimated from its rows, is multiplied by
-            (1 + r) / (1 − r).
-        descent_errors: Number of standard errors that is added to the estimate of J_c before the
-            falling limit follows it. With 0, the limit follows the lowest of several noisy
-            estimates, and so falls faster than the true cost of the policy.
         lowest_trust: Lower bound of trust_<cost>, the share of a predicted change of J_c that is
             expected to occur; 1 expects all of it.
         integral: Share of every violation that is added to the violations of all later updates (the
@@ -128,9 +119,7 @@ class LimitTracker(Checked, Resumable):
         (tensor([65.]), tensor([45.]))
     """
 
-    state_names = (
-        *("costs", "predictions", "_steps", "_reached", "_noise", "_integral", "_recovers"),
-    )
+    state_names = (*("costs", "predictions", "_steps", "_reached", "_noise", "_integral"),)
 
     def __init__(
         self,
@@ -149,20 +138,16 @@ class LimitTracker(Checked, Resumable):
         lowest_trust: Fraction,
         integral: NonNegativeFloat,
         largest_integral: NonNegativeFloat,
-        recovery: Share = 1.0,
-        largest_correlation: Weight = 0.0,
-        descent_errors: NonNegativeFloat = 0.0,
         steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         num_costs = len(self.limits)
         self.margin, self.largest_margin = margin, largest_margin
-        self.descent_errors = descent_errors
         shrinkage = min(1.0, latest_end * frames / max(free_steps + descent_steps, 1))
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
-        self.memory, self.recovery, self.steps_per_decision = memory, recovery, steps_per_decision
+        self.memory, self.steps_per_decision = memory, steps_per_decision
         self.smallest_scale = smallest_scale * steps_per_decision  # per time step of a batch
         self.costs = EpisodeCosts(
             num_costs,
@@ -170,14 +155,12 @@ class LimitTracker(Checked, Resumable):
             drift=drift,
             memory=memory,
             smallest=self.smallest_scale,
-            largest_correlation=largest_correlation,
         )
         self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
         self.integral, self.largest_integral = integral, largest_integral
         self._steps = 0
         self._integral = torch.zeros(num_costs)
         self._reached = torch.full((num_costs,), torch.inf)
-        self._recovers = torch.zeros(num_costs, dtype=torch.bool)
         self._noise = torch.full((num_costs,), torch.nan)
 
     @property
@@ -240,13 +223,6 @@ class LimitTracker(Checked, Resumable):
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
         # if the cost is already below the falling limit, the limit continues from the cost
-        present = estimate.mean + self.descent_errors * estimate.error
-        self._reached = torch.minimum(self._reached, present)
+        self._reached = torch.minimum(self._reached, estimate.mean)
         self._reached = descend(self._reached, self.limits - margin, share)
-        if left > num_steps:
-            return self._reached
-        safe = self.recovery * self.limits
-        self._recovers = torch.where(
-            self._recovers, estimate.mean > safe, estimate.mean > self.limits
-        )
-        return torch.where(self._recovers, torch.minimum(self._reached, safe), self._reached)
+        return self._reached

@@ -137,35 +137,6 @@ def test_costs_that_come_in_heaps_are_not_underestimated():
     assert estimate == pytest.approx(truth, rel=0.02)
 
 
-def of_correlated_rows(correlation: float, estimator: EpisodeCosts):
-    """An AR(1) series per row around a J_c of 50: errors of estimates, variances of batches."""
-    generator = torch.Generator().manual_seed(4)
-    rows, spread = 100, 0.06
-    rates = spread * torch.randn(rows, 1, generator=generator)
-    estimates, variances = [], []
-    for _ in range(3000):
-        fresh = spread * torch.randn(rows, 1, generator=generator)
-        rates = correlation * rates + (1 - correlation**2) ** 0.5 * fresh
-        estimates.append(estimator.update((0.05 + rates).unsqueeze(1), torch.empty(0)).mean - 50)
-        variances.append(estimator.batch.error.square())
-    return torch.cat(estimates[50:]), torch.cat(variances[50:])
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.45])
-def test_the_noise_of_batches_that_share_episodes_is_that_of_a_mean_of_many_of_them(correlation):
-    estimator = EpisodeCosts(1, max_length=1000, drift=0.05, memory=0.99, largest_correlation=0.6)
-    estimates, variances = of_correlated_rows(correlation, estimator)
-    assert estimator.noise.correlation.item() == pytest.approx(correlation, abs=0.05)
-    # known: the variance of a mean of n batches is 60² / 100 rows * (1 + r) / (1 - r) / n
-    known = 36 * (1 + correlation) / (1 - correlation)
-    assert variances.mean().item() == pytest.approx(known, rel=0.1)
-    independent = EpisodeCosts(1, max_length=1000, drift=0.05, memory=0.99)
-    others, naive = of_correlated_rows(correlation, independent)
-    assert naive.mean().item() == pytest.approx(36, rel=0.05)
-    if correlation > 0.3:  # the past counts for more, as it should
-        assert estimates.square().mean() < 0.8 * others.square().mean()
-
-
 def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
     costs = (torch.rand(4, 50, 1) < 0.2).float() * torch.tensor([1.0, 7.0])
     estimator = EpisodeCosts(2, max_length=50, drift=0.1, memory=0.9)

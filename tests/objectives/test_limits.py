@@ -52,27 +52,6 @@ def test_costs_are_free_then_the_limit_comes_down_from_what_the_policy_costs():
     assert (targets[5:] == 25).all()
 
 
-def halfway(descent_errors: float) -> float:
-    """The target in the middle of a descent from 60 to 25, if policies cost what is asked for."""
-    targets = []
-    for seed in range(10):
-        generator = torch.Generator().manual_seed(seed)
-        limits = tracker(
-            margin=0.0, free_steps=0, descent_steps=80_000, descent_errors=descent_errors
-        )
-        target = 60.0
-        for _ in range(20):
-            rates = target / 1000 + 0.06 * torch.randn(100, 1, 1, generator=generator)
-            target = limits.update(rates.expand(100, 20, 1), NO_EPISODES).target.item()
-        targets.append(target)
-    return sum(targets) / len(targets)
-
-
-def test_a_descent_that_allows_for_the_noise_of_estimates_is_not_faster_than_its_schedule():
-    assert halfway(descent_errors=1.0) == pytest.approx((60 + 25) / 2, abs=3)
-    assert halfway(descent_errors=0.0) < 35  # pulled down by the least of twenty estimates
-
-
 def test_in_a_short_run_the_descent_is_over_in_time():
     limits = tracker(margin=0.0, drift=None, frames=10_000)
     assert (limits.free_steps, limits.descent_steps) == (2_000, 5_000)
@@ -224,18 +203,6 @@ def test_costs_that_come_late_are_seen():
         state = limits.update(costs, NO_EPISODES)
     assert state.cost.item() > 40
     assert state.violation.item() > 15
-
-
-def test_with_hysteresis_a_violation_is_made_up_for_by_more_than_itself():
-    limits = tracker(
-        25.0, 25.0, margin=0.0, free_steps=0, descent_steps=0, drift=None, recovery=0.8
-    )
-    targets = []
-    for cost in (22.0, 26.0, 24.0, 21.0, 19.0, 24.0):
-        costs = torch.stack([torch.full((20, 100), cost / 1000), torch.zeros(20, 100)], -1)
-        targets.append(limits.update(costs, NO_EPISODES).target.tolist())
-    assert [first for first, _ in targets] == [25, 20, 20, 20, 25, 25]
-    assert [second for _, second in targets] == [25] * 6
 
 
 def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
