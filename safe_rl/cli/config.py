@@ -266,7 +266,13 @@ class General:
     default_cost_limits: Any
 
 
-ConfigStore.instance().store(name="general", node=General)
+_STORE = ConfigStore.instance()
+_STORE.store(name="general", node=General)
+# choices that leave a part out
+_STORE.store(group="risk", name="mean", node={"_target_": None})
+_STORE.store(group="logger", name="none", node={"_target_": None})
+_STORE.store(group="collector", name="local", node={"_target_": None, "num_collectors": 1})
+_STORE.store(group="model", name="mlp", node={"encoders": None, "memory": None})
 
 _PARTS = ("critic_update", "memory", "limits", "lagrangian", "advantage", "cost_advantage", "actor")
 

@@ -19,6 +19,7 @@ from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import Estimate
 
 _FACTOR = "x"
+_SETS = CONF / "variations.yaml"
 
 
 class Variation(NamedTuple):
@@ -45,8 +46,9 @@ def read_variations(given: Any) -> list[Variation]:
     """Variations that ``variations=…`` asks for, one for each value of a row's list.
 
     Args:
-        given: Name of a set in ``conf/variations`` (variations that the environment cannot have are
-            left out), path of such a YAML file, a mapping from row to keys, or a list of these.
+        given: Name of a set in ``conf/variations.yaml`` (variations that the environment cannot
+            have are left out), path of a YAML file with rows, a mapping from row to keys, or a list
+            of these.
 
     Raises:
         ValueError: If a set or file does not exist, has no rows, or has a key that is none of the
@@ -61,30 +63,40 @@ def read_variations(given: Any) -> list[Variation]:
     found: list[Variation] = []
     for part in given if isinstance(given, list) else [given]:
         is_set = isinstance(part, str) and not part.endswith((".yaml", ".yml"))
-        rows = _from_conf("variations", part) if is_set else part
+        rows = _set_of(part) if is_set else part
         if not isinstance(rows, Mapping):
             try:
                 rows = read_yaml(Path(part).expanduser())
             except (OSError, ValueError) as error:
                 raise ValueError(f"variations={part}: {error}") from error
         if not isinstance(rows, Mapping):
-            raise ValueError(f"variations={part}: it must have rows, as conf/variations has them.")
+            raise ValueError(f"variations={part}: it must have rows, as conf/variations.yaml has.")
         found += [
             v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])
         ]
     return found
 
 
-def _from_conf(group: str, name: str) -> Mapping[str, Any]:
-    """The content of a file of the package's configuration."""
-    known = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-    if name not in known:
+def _set_of(name: str) -> Mapping[str, Any]:
+    """A set of the package's configuration."""
+    sets = read_yaml(_SETS)
+    if name not in sets:
         raise ValueError(
-            f"variations: there is no '{name}' among {group}.{did_you_mean(name, known)} There "
-            f"are {', '.join(known)}; a file of yours ends in .yaml; keys are given as "
+            f"variations: there is no '{name}'.{did_you_mean(name, sets)} There are "
+            f"{', '.join(sets)}; a file of yours ends in .yaml; keys are given as "
             "variations='{heavy: {env.mass_scale: 1.5}}'."
         )
-    return read_yaml(CONF / group / f"{name}.yaml")
+    return sets[name]
+
+
+def _transform(name: str) -> Any:
+    """The settings of a transform in the package's configuration."""
+    files = {path.stem: path for path in (CONF / "transforms").glob("*.yaml")}
+    if name not in files:
+        raise ValueError(
+            f"variations: there is no '{name}' among transforms.{did_you_mean(name, sorted(files))}"
+        )
+    return read_yaml(files[name])[name]
 
 
 def _expand(row: str, keys: Any) -> Iterator[Variation]:
@@ -125,7 +137,7 @@ def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
         if part == "env":
             check_env_keys(changed.env, [name])
         elif name not in changed.transforms:
-            changed.transforms[name] = _from_conf("transforms", name)[name]
+            changed.transforms[name] = _transform(name)
         if isinstance(value, str) and value.startswith(_FACTOR):
             own = OmegaConf.select(changed, key)
             if not isinstance(own, int | float):

@@ -17,13 +17,13 @@ from safe_rl.cli.evaluate import main
 from safe_rl.cli.evaluating import evaluate_run
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, read_variations, varied
-from safe_rl.files import CONF
+from safe_rl.files import CONF, read_yaml
 
 pytestmark = pytest.mark.long
 
 SMALL = {"num_envs": 4, "frames_per_batch": 160, "frames": 160, "logger": "none", "num_threads": 1}
 QUICK = ("episodes=6", "num_envs=3", "num_threads=1")
-SETS = sorted(path.stem for path in (CONF / "variations").glob("*.yaml"))
+SETS = sorted(read_yaml(CONF / "variations.yaml"))
 
 
 @pytest.fixture(scope="module")
