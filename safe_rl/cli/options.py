@@ -7,7 +7,6 @@ dataclass: pydantic checks them by their annotations, and their help texts make 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
@@ -31,6 +30,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.checks import check_value
+from safe_rl.cli.terminal import end_by_interrupt, keep_streams
 from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
@@ -142,6 +142,7 @@ def run_command(
         command: The program, followed by its positional arguments in capitals.
         schema: Dataclass of its options.
     """
+    keep_streams()
     words = sys.argv[1:] if arguments is None else list(arguments)
     places = sum(word[0].isupper() for word in command.split())
     is_help = words[:1] in (["-h"], ["--help"])
@@ -159,10 +160,7 @@ def run_command(
         print(f"error: {printable(str(error))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGINT)
-        raise
+        end_by_interrupt()
 
 
 def _modules(word: str) -> list[str]:

@@ -26,6 +26,7 @@ from safe_rl.cli.composing import check_risk, explain, name_choices, overrides_o
 from safe_rl.cli.config import check_settings
 from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
 from safe_rl.cli.sweeps import run_in_sweep
+from safe_rl.cli.terminal import end_by_interrupt, keep_streams
 from safe_rl.cli.user_code import import_modules, split_imports, take_word
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF, printable
@@ -43,6 +44,7 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
     Raises:
         SystemExit: With a message of one line, if the words cannot be used.
     """
+    keep_streams()
     before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors, and does not print them
     try:
@@ -53,7 +55,7 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
             raise
         sys.exit(printable(explain(error, sys.argv[1:])))
     except KeyboardInterrupt:
-        sys.exit("Interrupted.")
+        end_by_interrupt()
     finally:
         sys.argv = before[0]
         os.environ.pop("HYDRA_FULL_ERROR")

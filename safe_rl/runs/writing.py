@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cache
@@ -133,14 +134,18 @@ class RunWriter:
         return [dict(zip(table, row, strict=True)) for row in zip(*table.values(), strict=True)]
 
     def draw_curves(self) -> None:
-        """Write ``curves.png`` from the table."""
+        """Write ``curves.png`` from the table; if that fails, say so: training goes on."""
         # imported here: matplotlib takes half a second
         from safe_rl.runs.curves import learning_curves, save_figure
 
         table, config = read_table(self.run.table_file), self._config
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
-        figure = learning_curves(table, self._cost_limits, self._episode_length, title)
-        save_figure(figure, self.run.curves_file)
+        try:
+            figure = learning_curves(table, self._cost_limits, self._episode_length, title)
+            save_figure(figure, self.run.curves_file)
+        except (OSError, RuntimeError, ValueError) as error:  # such as text.usetex without LaTeX
+            reason = " ".join(str(error).split())
+            print(f"{self.run.curves_file} was not drawn: {reason}", file=sys.stderr)
 
     def summary(self) -> str:
         """One line about the end of the run."""

@@ -9,7 +9,7 @@ import sys
 import termios
 
 import pytest
-from commands import ROOT, SMALL
+from commands import ROOT, SMALL, in_a_process
 
 from safe_rl.runs.table import read_table
 
@@ -62,3 +62,31 @@ def test_a_run_that_ignores_the_signal_is_certified(tmp_path):
     assert close_terminal(run, "SIG_IGN", "frames=2_000", limit, *test) == 0
     assert len(read_table(run / "progress.csv")["epoch"]) == 50
     assert (run / "certificate.json").is_file()
+
+
+@pytest.mark.long
+def test_closed_streams_and_narrow_encodings_end_no_run(tmp_path):
+    """A closed standard error ended tqdm, and ASCII an evaluation after it was done."""
+    words = [sys.executable, "train.py", *SMALL, "frames=80", f"hydra.run.dir={tmp_path / 'run'}"]
+    subprocess.run(["sh", "-c", '"$@" 2>&-', "sh", *words], cwd=ROOT, check=True)
+    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 2
+    changes = ["certify=true", "certificate.episodes=2", "certificate.ranking=2"]
+    words = [sys.executable, "-m", "safe_rl", "evaluate", str(tmp_path / "run"), *changes]
+    ascii_only = os.environ | {"PYTHONIOENCODING": "ascii"}
+    said = subprocess.run(words, cwd=ROOT, env=ascii_only, capture_output=True, text=True)
+    assert "codec can't encode" not in said.stderr
+    assert "mean_cost \\u2264" in said.stdout
+
+
+@pytest.mark.long
+def test_a_picture_that_cannot_be_drawn_ends_no_run(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    said = in_a_process(
+        *("train.py", *SMALL, "frames=80", f"hydra.run.dir={tmp_path / 'run'}"),
+        MATPLOTLIBRC=str(tmp_path),
+        PATH=str(tmp_path / "bin"),  # without LaTeX
+    )
+    assert "curves.png was not drawn: " in said
+    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 2
