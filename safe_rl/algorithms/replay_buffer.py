@@ -204,10 +204,7 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
     if torch is newer than the version it was built for; it samples from NumPy's generator, which a
     run does not seed; and it gives new transitions no priority. This class sums all priorities for
     every sample, a millisecond for a million transitions. It is a subclass, because only those get
-    priorities from a buffer's ``update_tensordict_priority``.
-
-    Raises:
-        ValueError: When samples are drawn, if the storage has more than one dimension.
+    priorities from a buffer's ``update_tensordict_priority``. The storage has one dimension.
     """
 
     state_names = ("_priorities", "_largest")
@@ -233,8 +230,6 @@ class ProportionalSampler(Resumable, PrioritizedSampler):
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Draw indices [B] with replacement, with importance weights [B] as ``priority_weight``."""
-        if storage.ndim > 1:
-            raise ValueError("ProportionalSampler needs a storage of one dimension: flatten steps.")
         present = self._priorities[: len(storage)]
         sums = present.cumsum(0)
         drawn = torch.rand(batch_size, dtype=sums.dtype, generator=self._rng) * sums[-1]

@@ -13,9 +13,14 @@ from safe_rl.collectors.datasets import (
     safe_episodes,
     safety_gymnasium_columns,
 )
-from safe_rl.collectors.factory import make_collector, make_process_collector, make_ray_collector
 from safe_rl.collectors.recording import Recording, StepRecorder, match_columns, read_recording
-from safe_rl.collectors.workers import WorkerCollector, WorkerError
+from safe_rl.collectors.workers import (
+    WorkerCollector,
+    WorkerError,
+    make_collector,
+    make_process_collector,
+    make_ray_collector,
+)
 
 __all__ = [
     "EpisodeAccounting",

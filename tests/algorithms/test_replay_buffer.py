@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
-from torchrl.data import Bounded, LazyTensorStorage
+from torchrl.data import Bounded
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.algorithms import Memory, ReplayUpdate
@@ -208,8 +208,6 @@ def test_a_buffer_of_torchrl_passes_errors_to_the_sampler():
     buffer.add(make_batch(4, 1, rows=1)[0, 0])
     found = buffer.sampler.state_dict()["_priorities"][:5]
     assert found.numpy() == pytest.approx(np.sqrt([0, 1, 2, 3, 3]), abs=1e-3)
-    with pytest.raises(ValueError, match="one dimension"):
-        buffer.sampler.sample(LazyTensorStorage(9, ndim=2), 1)
 
 
 def test_errors_are_read_where_the_loss_writes_them():
