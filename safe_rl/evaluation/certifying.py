@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -109,10 +110,10 @@ def certify(
 def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) -> tuple[int, float]:
     """Number and error probability of a test of a run; both are noted before its first episode."""
     tests = read_json(run.tests_file) if run.tests_file.is_file() else []
-    asked = {"options": asdict(options), "limits": run.cost_limits}
+    asked: dict[str, Any] = {"options": asdict(options), "limits": run.cost_limits}
     asked["candidates"] = [path.name for path in candidates]
     for number, former in enumerate(tests, 1):
-        if all(former[key] == value for key, value in asked.items()):
+        if all(former.get(key) == value for key, value in asked.items()):
             return number, former["error"]
     spent = [former["error"] for former in tests]
     error = error_of_next_test(options.level, spent)
@@ -140,7 +141,7 @@ def _ranked(
         rounds = [int(share * options.ranking) for share in _ROUNDS]
         rounds[-1] = options.ranking - sum(rounds[:-1])
     found: list[list[Episodes]] = [[] for _ in trials]
-    left, given_up = list(range(len(trials))), []
+    left, given_up = list(range(len(trials))), list[int]()
     for part, number in enumerate(rounds):
         seed = _RANKING + part * _NEXT_BATCH
         for group in [left] if together else [[one] for one in left]:
@@ -151,7 +152,11 @@ def _ranked(
         costs = [_costs(*own) for own in found]
         claims = [claim.with_thresholds(own) for own in costs]
         returns = [torch.cat([part.returns for part in own]).numpy() for own in found]
-        order = rank(*([values[one] for one in left] for values in (returns, costs, claims)))
+        order = rank(
+            [returns[one] for one in left],
+            [costs[one] for one in left],
+            [claims[one] for one in left],
+        )
         left = [left[place] for place in order]
         kept = max(options.tests, -(-len(left) // 2)) if part + 1 < len(rounds) else len(left)
         left, given_up = left[:kept], left[kept:] + given_up

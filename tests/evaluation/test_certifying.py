@@ -5,6 +5,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,12 +15,13 @@ from run_configs import point_mass_config
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify, certifying
 from safe_rl.evaluation.certifying import _RANKING, _TEST, _run, _write
+from safe_rl.evaluation.episodes import Episodes
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.reporting.tables import read_certificate
 from safe_rl.runs.run import Run
-from safe_rl.scores.certificate import Verdict
+from safe_rl.scores.certificate import Claim, Verdict
 from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
@@ -235,6 +237,25 @@ def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train
         certify(directory, OPTIONS, make_env=make)
     different = [set(seeds) for seeds in met.values()]
     assert len(set.union(*different)) == sum(map(len, different))
+
+
+def test_the_ranking_gives_up_the_worse_half_in_every_round(monkeypatch):
+    """Sixteen candidates; the higher their number, the more they cost, all above the limit."""
+    used = dict.fromkeys(range(16), 0)
+
+    def run(trials, seed, number, progress):
+        (trial,) = trials
+        used[trial.number] += number
+        costs = 20.0 + trial.number + torch.rand(number) / 10
+        yield {"cost": 100.0}, [Episodes(costs, costs, {"cost": costs})]
+
+    monkeypatch.setattr(certifying, "_run", run)
+    trials = [SimpleNamespace(node={}, number=number) for number in used]
+    claim = Claim({"cost": 19.0})
+    order, claims = certifying._ranked(trials, claim, replace(OPTIONS, ranking=40), False)
+    assert order == list(range(16))
+    assert [used[number] for number in order] == [40] * 4 + [20] * 4 + [10] * 8
+    assert {one.highest["cost"] for one in claims} == {100.0}
 
 
 def test_policies_that_share_a_simulation_get_their_own_episodes(monkeypatch):
