@@ -169,7 +169,7 @@ def checked(function: Function) -> Function:
         safe_rl.checks.SettingError: gamma=true: it must be a valid number.
     """
     if isclass(function):
-        function.__init__ = checked(function.__init__)  # type: ignore[misc]
+        function.__init__ = checked(function.__init__)  # type: ignore[method-assign]
         return function
 
     @cache

@@ -44,226 +44,140 @@ Folder = Annotated[Text, rule(lambda name: "/" not in name, "a name of a folder,
 
 @dataclass
 class Checkpoint:
-    """When checkpoints are written, and which are kept: the section ``checkpoint``.
+    """When checkpoints are written, and which are kept: the section ``checkpoint``."""
 
-    Attributes:
-        interval: Seconds between checkpoints.
-        keep_last: Number of last checkpoints that are kept.
-        keep_best: Number of best checkpoints that are kept besides.
-        best_over: Epochs in the mean return and costs by which checkpoints are compared.
-    """
-
-    interval: NonNegativeFloat
-    keep_last: Kept
-    keep_best: Kept
-    best_over: Kept
+    interval: NonNegativeFloat  # seconds between checkpoints
+    keep_last: Kept  # number of last checkpoints that are kept
+    keep_best: Kept  # number of best checkpoints that are kept besides
+    best_over: Kept  # epochs in the mean return and costs by which checkpoints are compared
 
 
 @dataclass
 class Evaluation:
-    """Evaluations while training: the section ``evaluation``.
+    """Evaluations while training: the section ``evaluation``."""
 
-    Attributes:
-        interval: Steps between evaluations.
-        episodes: Episodes of an evaluation.
-    """
-
-    interval: Whole
-    episodes: Annotated[int, Interval(ge=1, le=10**6)]
+    interval: Whole  # steps between evaluations
+    episodes: Annotated[int, Interval(ge=1, le=10**6)]  # episodes of an evaluation
 
 
 @dataclass
 class Dataset:
-    """Transitions that are in the replay buffer from the beginning: the section ``dataset``.
+    """Transitions that are in the replay buffer from the beginning: the section ``dataset``."""
 
-    Attributes:
-        path: Folder of a recording, or an HDF5 file.
-        columns: Order of observed columns in a file that does not name them; null: as here.
-        safe_episodes: Whether only episodes within the limits are taken.
-        alone: Whether to learn from the dataset only.
-    """
-
-    path: Text | None
+    path: Text | None  # folder of a recording, or an HDF5 file
+    # order of observed columns in a file that does not name them; null: as here
     columns: Annotated[Any, typed(Literal["safety_gymnasium"] | None)]
-    safe_episodes: bool
-    alone: bool
+    safe_episodes: bool  # whether only episodes within the limits are taken
+    alone: bool  # whether to learn from the dataset only
 
 
 @dataclass
 class Critics:
-    """Sizes of the ensembles of Q functions: the section ``critics``.
+    """Sizes of the ensembles of Q functions: the section ``critics``."""
 
-    Attributes:
-        rewards: Number of Q functions of the reward.
-        costs: Number of Q functions of the costs.
-        cost_values: What a Q function of the costs returns; null: the mean.
-    """
-
-    rewards: Annotated[int, Interval(ge=0, le=1000)]
-    costs: Annotated[int, Interval(ge=0, le=1000)]
-    cost_values: Any = None
+    rewards: Annotated[int, Interval(ge=0, le=1000)]  # number of Q functions of the reward
+    costs: Annotated[int, Interval(ge=0, le=1000)]  # number of Q functions of the costs
+    cost_values: Any = None  # what a Q function of the costs returns; null: the mean
 
 
 @dataclass
 class Exploration:
-    """Exploration of off-policy algorithms: the section ``exploration``.
+    """Exploration of off-policy algorithms: the section ``exploration``."""
 
-    Attributes:
-        random_steps: Random steps at the beginning.
-        noise: Standard deviation of a deterministic policy's noise, in half ranges of actions.
-    """
-
-    random_steps: Annotated[Any, typed(NonNegativeInt)]
+    random_steps: Annotated[Any, typed(NonNegativeInt)]  # random steps at the beginning
+    # standard deviation of a deterministic policy's noise, in half ranges of actions
     noise: NonNegativeFloat
 
 
 @dataclass
 class Encoders:
-    """Encoders of the entries of an observation: the section ``model.encoders``.
+    """Encoders of the entries of an observation: the section ``model.encoders``."""
 
-    Attributes:
-        vector: Widths of the layers for a vector.
-        channels: Channels of the convolutions for an image.
-        kernels: Kernel sizes of these convolutions [pixels].
-        strides: Strides of these convolutions [pixels].
-    """
-
-    vector: list[Width]
-    channels: list[Width]
-    kernels: list[Width]
-    strides: list[Width]
+    vector: list[Width]  # widths of the layers for a vector
+    channels: list[Width]  # channels of the convolutions for an image
+    kernels: list[Width]  # kernel sizes of these convolutions [pixels]
+    strides: list[Width]  # strides of these convolutions [pixels]
 
 
 @dataclass
 class Recurrence:
-    """A recurrent layer: the section ``model.memory``.
+    """A recurrent layer: the section ``model.memory``."""
 
-    Attributes:
-        size: Size of the recurrent state.
-    """
-
-    size: Width
+    size: Width  # size of the recurrent state
 
 
 @dataclass
 class Model:
-    """The networks: the section ``model``, unless a ``_target_`` names a function of one's own.
+    """The networks: the section ``model``, unless a ``_target_`` names a function of one's own."""
 
-    Attributes:
-        hidden_sizes: Widths of the hidden layers.
-        initial_log_std: Logarithm of the initial standard deviation of actions.
-        input_scale: Factors by component of the observation.
-        head: Distribution of the actions.
-        normalise: Bound of normalised observations; null: they are not normalised.
-        encoders: Encoders of the entries of an observation.
-        memory: A recurrent layer.
-    """
-
-    hidden_sizes: list[Width]
+    hidden_sizes: list[Width]  # widths of the hidden layers
+    # logarithm of the initial standard deviation of actions
     initial_log_std: Annotated[float, Interval(ge=-20, le=10)]
-    input_scale: dict[str, PositiveFloat]
+    input_scale: dict[str, PositiveFloat]  # factors by component of the observation
+    # distribution of the actions
     head: Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
+    # bound of normalised observations; null: they are not normalised
     normalise: PositiveFloat | None
-    encoders: Encoders | None
-    memory: Recurrence | None
+    encoders: Encoders | None  # encoders of the entries of an observation
+    memory: Recurrence | None  # a recurrent layer
 
 
 @dataclass
 class Algo:
-    """The algorithm: the section ``algo``. An algorithm of one's own may have further keys there.
+    """The algorithm: the section ``algo``, where one of the user's own may have further keys."""
 
-    Attributes:
-        name: Its name in folders and reports.
-        constrained: Whether it keeps the limits; otherwise costs are only recorded.
-    """
-
-    name: Folder
-    constrained: bool
+    name: Folder  # its name in folders and reports
+    constrained: bool  # whether it keeps the limits; otherwise costs are only recorded
 
 
 @dataclass(init=False, repr=False, eq=False)
 class General:
-    """The keys at the top of a configuration; those of type `Any` hold parts, or have no value.
+    """The keys at the top of a configuration; those of type `Any` hold parts, or have no value."""
 
-    Attributes:
-        frames: Environment steps to train for.
-        num_envs: Environments that are stepped together.
-        frames_per_batch: Steps of all environments in one batch.
-        staggered_starts: Whether environments begin at different steps of their first episodes.
-        seed: Seed of the run.
-        cost_limits: Cost allowed per episode, by cost: ``cost_limits='{cost: 25}'``.
-        init_from: Run or checkpoint whose trained networks this run starts from.
-        record: Whether all transitions are written to disk.
-        note: A note, kept in the run's config.yaml.
-        device: Where networks are trained: cpu or cuda.
-        num_threads: Threads of physics and torch; null: all cores.
-        compile: Whether to compile the losses of on-policy algorithms.
-        checkpoint: When checkpoints are written.
-        certificate: The test at the end of a run, see `CertificateOptions`.
-        env: The environment.
-        transforms: Changes of the problem, by name.
-        collector: Where environments are stepped.
-        logger: A logger besides progress.csv.
-        algo: The algorithm.
-        model: The networks, see `Model`.
-        risk: The measure of episode costs that is limited.
-        limits: How the limit is approached.
-        lagrangian: The multiplier.
-        loss: The loss of the policy.
-        policy_update: The update of the policy.
-        advantage: Estimator of the reward's advantages.
-        cost_advantage: Estimator of the costs' advantages.
-        critic_update: The update of the critics.
-        memory: The replay buffer.
-        actor: The policy of off-policy algorithms.
-        critics: Sizes of the ensembles of Q functions.
-        exploration: Exploration of off-policy algorithms.
-        dataset: Transitions that are in the replay buffer from the beginning.
-        evaluation: Evaluations while training; null: none.
-        preset: Name of the preset whose keys replace the algorithm's.
-        paper: Numbers of `algo=paper/…` for some robots.
-        default_cost_limits: `cost_limits` unless they are given.
-    """
-
-    frames: Whole
-    num_envs: Whole
-    frames_per_batch: Whole
+    frames: Whole  # environment steps to train for
+    # environments that are stepped together
+    num_envs: Annotated[Any, typed(Annotated[int, Interval(ge=1, le=10**6)])]
+    # steps of all environments in one batch
+    frames_per_batch: Annotated[Any, typed(Annotated[int, Interval(ge=1, le=10**8)])]
+    # whether environments begin at different steps of their first episodes
     staggered_starts: bool | None
-    seed: Annotated[int, Interval(ge=0, le=2**62)]
+    seed: Annotated[int, Interval(ge=0, le=2**62)]  # seed of the run
+    # cost allowed per episode, by cost: cost_limits='{cost: 25}'
     cost_limits: Annotated[Any, typed(dict[str, NonNegativeFloat])]
-    init_from: Text | None
-    record: bool
-    note: Any
+    init_from: Text | None  # run or checkpoint whose trained networks this run starts from
+    record: bool  # whether all transitions are written to disk
+    note: Any  # a note, kept in the run's config.yaml
     # modules of the user: a keyword of Python, which only a text can name
     __annotations__["import"] = "list[str]"
-    device: Device
+    device: Device  # where networks are trained: cpu or cuda
+    # threads of physics and torch; null: all cores
     num_threads: Annotated[int, Interval(ge=1, le=1024)] | None
-    compile: bool
-    checkpoint: Checkpoint
-    certificate: Any
-    env: Any
-    transforms: Any
-    collector: Any
-    logger: Any
-    algo: Any
-    model: Any
-    risk: Any
-    limits: Any
-    lagrangian: Any
-    loss: Any
-    policy_update: Any
-    advantage: Any
-    cost_advantage: Any
-    critic_update: Any
-    memory: Any
-    actor: Any
-    critics: Critics | None
-    exploration: Exploration | None
-    dataset: Dataset | None
-    evaluation: Evaluation | None
-    preset: Text
-    paper: Any
-    default_cost_limits: Any
+    compile: bool  # whether to compile the losses of on-policy algorithms
+    checkpoint: Checkpoint  # when checkpoints are written
+    certificate: Any  # the test at the end of a run, see CertificateOptions
+    env: Any  # the environment
+    transforms: Any  # changes of the problem, by name
+    collector: Any  # where environments are stepped
+    logger: Any  # a logger besides progress.csv
+    algo: Any  # the algorithm
+    model: Any  # the networks, see Model
+    risk: Any  # the measure of episode costs that is limited
+    limits: Any  # how the limit is approached
+    lagrangian: Any  # the multiplier
+    loss: Any  # the loss of the policy
+    policy_update: Any  # the update of the policy
+    advantage: Any  # estimator of the reward's advantages
+    cost_advantage: Any  # estimator of the costs' advantages
+    critic_update: Any  # the update of the critics
+    memory: Any  # the replay buffer
+    actor: Any  # the policy of off-policy algorithms
+    critics: Critics | None  # sizes of the ensembles of Q functions
+    exploration: Exploration | None  # exploration of off-policy algorithms
+    dataset: Dataset | None  # transitions that are in the replay buffer from the beginning
+    evaluation: Evaluation | None  # evaluations while training; null: none
+    preset: Text  # name of the preset whose keys replace the algorithm's
+    paper: Any  # numbers of algo=paper/… for some robots
+    default_cost_limits: Any  # cost_limits unless they are given
 
 
 _STORE = ConfigStore.instance()
