@@ -47,8 +47,8 @@ class UpperSemideviation(RiskMeasure):
 
     state_names = ("_mean",)  # what checkpoints keep of it
 
-    def __init__(self, cost_limits: Tensor, *, weight: float, memory: float) -> None:
-        self.limits, self.weight, self.memory = cost_limits, weight, memory
+    def __init__(self, cost_limits: Tensor, *, weight: float, decay: float) -> None:
+        self.limits, self.weight, self.decay = cost_limits, weight, decay
         self._mean = torch.full_like(cost_limits, torch.inf)  # no episode is above it yet
 
     def __call__(
@@ -58,7 +58,7 @@ class UpperSemideviation(RiskMeasure):
         if len(finished):
             mean = finished.float().mean(0)
             known = self._mean.isfinite()
-            self._mean = torch.where(known, torch.lerp(mean, self._mean, self.memory), mean)
+            self._mean = torch.where(known, torch.lerp(mean, self._mean, self.decay), mean)
         beyond = (cost_so_far(costs, ends, before) - self._mean).clamp_min(0)
         penalised = costs + self.weight * torch.minimum(costs, beyond)
         return PenalisedCosts(penalised, offset=torch.zeros_like(self.limits), limit=self.limits)

@@ -32,8 +32,8 @@ class CPOStep(TRPOStep):
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
         rescale_violation: Whether to divide the violations by the episode length: b is the gradient
             of an average per time step, so c has to be one too.
-        largest_demand: Upper bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the largest
-            decrease of the surrogate within the trust region; None: no bound. Without a bound, a
+        largest_required_decrease: Upper bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the
+            largest decrease of the surrogate within the trust region; None: no bound. Without it, a
             policy far above its limit takes recovery steps (case 0), which ignore the reward, until
             the limit is reached: a return learned in 20 updates is forgotten in as many. With 0.8
             and one constraint, √(1 − 0.8²) = 0.6 of the step are left for the reward.
@@ -60,11 +60,14 @@ class CPOStep(TRPOStep):
         loss: Loss,
         *,
         rescale_violation: bool,
-        largest_demand: PositiveFloat | None = None,
+        largest_required_decrease: PositiveFloat | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        self.rescale_violation, self.largest_demand = rescale_violation, largest_demand
+        self.rescale_violation, self.largest_required_decrease = (
+            rescale_violation,
+            largest_required_decrease,
+        )
 
     def _propose(self, problem: StepProblem) -> Proposal:
         g, b, c = self._linearised(problem)
@@ -79,11 +82,11 @@ class CPOStep(TRPOStep):
         return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
 
     def _bounded(self, c: Tensor, s: Tensor) -> Tensor:
-        """c, bounded by the share `largest_demand` of the surrogates' largest decrease, [k]."""
-        if self.largest_demand is None:
+        """c, bounded by a share of the surrogates' largest decrease, [k]."""
+        if self.largest_required_decrease is None:
             return c
         within_reach = (2 * self.target_kl * s.clamp_min(0)).sqrt()
-        return torch.minimum(c, self.largest_demand * within_reach)
+        return torch.minimum(c, self.largest_required_decrease * within_reach)
 
     @staticmethod
     def _acceptance(

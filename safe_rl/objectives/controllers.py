@@ -133,8 +133,10 @@ class PIDMultiplier(Multiplier):
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())
         for name in ("smoothed_error", "smoothed_cost"):
-            self.register_buffer(name, torch.zeros(self.num_costs))
-        self.register_buffer("past_costs", torch.zeros(derivative_delay, self.num_costs))
+            self.register_buffer(name, torch.zeros_like(self.limits))
+        self.register_buffer(
+            "past_costs", torch.zeros_like(self.limits).repeat(derivative_delay, 1)
+        )
 
     def _step(self, state: LimitState) -> dict[str, Tensor]:
         error = state.violation / self.scale

@@ -134,7 +134,8 @@ class EpisodeLengths(Resumable):
     def mean(self) -> Tensor:
         """T̄ in steps, scalar."""
         steps, ends, early = self.counts.sum(0).tolist()
-        return torch.tensor(min(steps / ends, self.longest) if early else float(self.longest))
+        mean = min(steps / ends, self.longest) if early else float(self.longest)
+        return torch.tensor(mean, dtype=torch.float32)
 
 
 class EpisodeCosts(Resumable):
@@ -145,12 +146,12 @@ class EpisodeCosts(Resumable):
         max_length: Largest length of an episode in steps; see `EpisodeLengths`.
         drift: Expected relative change of J_c from one policy to the next; it sets the weights of
             past batches and of the new one. None uses the new batch alone.
-        memory: Weight in [0, 1) of the past in the estimated variance of costs.
+        decay: Weight in [0, 1) of the past in the estimated variance of costs.
         smallest: Costs per step, of size `unit`. The drift is relative to J_c, or to the J_c of
             this many costs if it is larger. Otherwise an estimate of 0 could never change again.
 
     Examples:
-        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
+        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
         >>> costs = torch.zeros(4, 200, 1)
         >>> costs[:, ::50] = 1.0
         >>> estimator.update(costs, torch.empty(0)).mean
@@ -165,16 +166,16 @@ class EpisodeCosts(Resumable):
         *,
         max_length: float,
         drift: float | None,
-        memory: float,
+        decay: float,
         smallest: float = 0.0,
     ) -> None:
-        self.drift, self.memory, self.smallest = drift, memory, smallest
+        self.drift, self.decay, self.smallest = drift, decay, smallest
         self.lengths = EpisodeLengths(max_length)
-        self._mean, self._error = torch.full((2, num_costs), torch.nan)
+        self._mean, self._error = torch.full((2, num_costs), torch.nan, dtype=torch.float32)
         #: The estimate from the last batch alone.
         self.batch = self.estimate
         self._sums = torch.zeros(2, num_costs, dtype=torch.float64)
-        self._scatter = torch.zeros(2, num_costs)
+        self._scatter = torch.zeros(2, num_costs, dtype=torch.float32)
 
     @property
     def length(self) -> Tensor:
@@ -206,8 +207,7 @@ class EpisodeCosts(Resumable):
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         limited = costs if penalised is None else penalised.costs.to(costs)
-        mean, error = (part.float() for part in rate_estimate(limited, self.length))
-        batch = CostEstimate(mean, error)
+        batch = CostEstimate(*(each.float() for each in rate_estimate(limited, self.length)))
         if penalised is not None:
             batch = batch._replace(mean=batch.mean + penalised.offset)
         self.batch = batch
@@ -231,7 +231,7 @@ class EpisodeCosts(Resumable):
         counts. The factor of proportionality is estimated.
         """
         seen = torch.stack([batch.error.square(), self._size(batch.mean)])
-        self._scatter = torch.lerp(seen, self._scatter, self.memory)
+        self._scatter = torch.lerp(seen, self._scatter, self.decay)
         squared, sizes = self._scatter
         error = (squared / sizes * size).sqrt()
         return torch.where(error.isfinite(), error, batch.error)

@@ -38,11 +38,11 @@ class PredictedChange(Resumable):
 
     Args:
         num_costs: k.
-        memory: Weight in [0, 1) of the past.
+        decay: Weight in [0, 1) of the past.
         lowest: Lower bound of the share; with 1, predictions are not corrected.
 
     Examples:
-        >>> realised = PredictedChange(1, memory=0.9, lowest=0.1)
+        >>> realised = PredictedChange(1, decay=0.9, lowest=0.1)
         >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were predicted
         ...     realised.update(torch.tensor([cost]), prior=torch.tensor([1.0]))
         ...     realised.record_prediction(torch.tensor([-10.0]))
@@ -52,10 +52,10 @@ class PredictedChange(Resumable):
 
     state_names = ("_predicted", "_cost", "_products")
 
-    def __init__(self, num_costs: int, *, memory: float, lowest: float) -> None:
-        self.memory, self.lowest = memory, lowest
-        self._predicted, self._cost = torch.full((2, num_costs), torch.nan)
-        self._products = torch.zeros(2, num_costs)
+    def __init__(self, num_costs: int, *, decay: float, lowest: float) -> None:
+        self.decay, self.lowest = decay, lowest
+        self._predicted, self._cost = torch.full((2, num_costs), torch.nan, dtype=torch.float32)
+        self._products = torch.zeros(2, num_costs, dtype=torch.float32)
 
     @property
     def share(self) -> Tensor:
@@ -71,7 +71,7 @@ class PredictedChange(Resumable):
         predicted = self._predicted
         products = predicted * torch.stack([cost - self._cost, predicted])
         known = products.isfinite().all(0)
-        updated = self.memory * self._products + products
+        updated = self.decay * self._products + products
         self._products = torch.where(known, updated, self._products)
         self._cost = cost.clone()
         self._predicted = torch.full_like(predicted, torch.nan)
@@ -98,9 +98,9 @@ class LimitTracker(Checked, Resumable):
         smallest_scale: Lower bound of the unit of violations, in costs per step, for limits near 0.
         drift: Expected relative change of J_c per update, see `EpisodeCosts`; None uses each batch
             alone.
-        memory: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
-        lowest_trust: Lower bound of trust_<cost>, the share of a predicted change of J_c that is
-            expected to occur; 1 expects all of it.
+        decay: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
+        lowest_realised_share: Lower bound of the share of a predicted change of J_c that is
+            expected to occur (column trust_<cost>); 1 expects all of it.
         integral: Share of every violation that is added to the violations of all later updates (the
             learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
             have integrals of their own.
@@ -110,7 +110,7 @@ class LimitTracker(Checked, Resumable):
         >>> tracker = LimitTracker(
         ...     torch.tensor([25.0]), max_length=1000, margin=0.0, largest_margin=0.2,
         ...     free_steps=0, descent_steps=800, frames=10_000, latest_end=0.7,
-        ...     smallest_scale=0.01, drift=0.2, memory=0.9, lowest_trust=1.0, integral=0.0,
+        ...     smallest_scale=0.01, drift=0.2, decay=0.9, lowest_realised_share=1.0, integral=0.0,
         ...     largest_integral=0.5,
         ... )
         >>> costs = torch.full((4, 100, 1), 0.065)
@@ -134,8 +134,8 @@ class LimitTracker(Checked, Resumable):
         latest_end: Fraction,
         smallest_scale: PositiveFloat,
         drift: PositiveFloat | None,
-        memory: Weight,
-        lowest_trust: Fraction,
+        decay: Weight,
+        lowest_realised_share: Fraction,
         integral: NonNegativeFloat,
         largest_integral: NonNegativeFloat,
         steps_per_decision: int = 1,
@@ -147,21 +147,21 @@ class LimitTracker(Checked, Resumable):
         self.free_steps = round(free_steps * shrinkage)
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
-        self.memory, self.steps_per_decision = memory, steps_per_decision
+        self.decay, self.steps_per_decision = decay, steps_per_decision
         self.smallest_scale = smallest_scale * steps_per_decision  # per time step of a batch
         self.costs = EpisodeCosts(
             num_costs,
             max_length=max_length,
             drift=drift,
-            memory=memory,
+            decay=decay,
             smallest=self.smallest_scale,
         )
-        self.predictions = PredictedChange(num_costs, memory=memory, lowest=lowest_trust)
+        self.predictions = PredictedChange(num_costs, decay=decay, lowest=lowest_realised_share)
         self.integral, self.largest_integral = integral, largest_integral
         self._steps = 0
-        self._integral = torch.zeros(num_costs)
-        self._reached = torch.full((num_costs,), torch.inf)
-        self._noise = torch.full((num_costs,), torch.nan)
+        self._integral = torch.zeros_like(self.limits)
+        self._reached = torch.full_like(self.limits, torch.inf)
+        self._noise = torch.full_like(self.limits, torch.nan)
 
     @property
     def schedule(self) -> str:
@@ -196,7 +196,7 @@ class LimitTracker(Checked, Resumable):
         smallest = self.smallest_scale * self.costs.length * self.costs.unit
         scale = torch.maximum(self.limits, smallest)
         self.predictions.update(batch.mean, prior=0.5 * scale)
-        noise = torch.lerp(batch.error, self._noise, self.memory)
+        noise = torch.lerp(batch.error, self._noise, self.decay)
         self._noise = torch.where(noise.isfinite(), noise, batch.error)
         num_steps = costs.shape[0] * costs.shape[1] * self.steps_per_decision
         target = self._target(estimate, scale, num_steps)

@@ -170,7 +170,7 @@ class LagrangeMultiplier(Multiplier):
         # softplus⁻¹(λ) = log(exp(λ) − 1), in the form that does not overflow.
         self.register_buffer("nu", initial + torch.log(-torch.expm1(-initial)))
         for name in ("step", "exp_avg", "exp_avg_sq"):
-            self.register_buffer(name, torch.zeros(self.num_costs))
+            self.register_buffer(name, torch.zeros_like(self.limits))
 
     @property
     def value(self) -> Tensor:

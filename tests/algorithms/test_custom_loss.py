@@ -37,7 +37,7 @@ def test_penalised_costs_sum_to_mean_and_semideviation():
     ends = torch.zeros(6, 10, dtype=torch.bool)
     ends[:, -1] = True
     totals = costs.sum(1)
-    risk = custom_loss.UpperSemideviation(torch.tensor([1.0]), weight=0.5, memory=0.0)
+    risk = custom_loss.UpperSemideviation(torch.tensor([1.0]), weight=0.5, decay=0.0)
     penalised = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
     expected = totals.mean() + 0.5 * (totals - totals.mean()).clamp_min(0).mean()
     torch.testing.assert_close(penalised.mean(), expected)

@@ -22,8 +22,8 @@ from safe_rl.objectives import (
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
 TRACKER = {
     "max_length": 5, "margin": 0.5, "largest_margin": 0.2, "free_steps": 0, "descent_steps": 100,
-    "frames": 1000, "latest_end": 0.7, "smallest_scale": 0.01, "drift": 0.2, "memory": 0.9,
-    "lowest_trust": 0.1, "integral": 0.0, "largest_integral": 0.5,
+    "frames": 1000, "latest_end": 0.7, "smallest_scale": 0.01, "drift": 0.2, "decay": 0.9,
+    "lowest_realised_share": 0.1, "integral": 0.0, "largest_integral": 0.5,
 }  # fmt: skip
 WRITTEN = {
     "actor": {"action": "action", "log_prob": "action_log_prob"},

@@ -218,7 +218,7 @@ def test_a_bounded_demand_leaves_the_rest_of_the_step_to_the_reward():
         found, metrics = whole_step(step, batch, limit_state(violation))
         return found.double(), metrics
 
-    step, found = taken(1e4, largest_demand=0.8)
+    step, found = taken(1e4, largest_required_decrease=0.8)
     radius = (2 * DELTA) ** 0.5
     w, v = torch.linalg.solve(matrix, b), torch.linalg.solve(matrix, g)
     along = w / (b @ w).sqrt()
@@ -229,7 +229,9 @@ def test_a_bounded_demand_leaves_the_rest_of_the_step_to_the_reward():
     difference = step - expected
     assert (difference @ matrix @ difference).sqrt() < 0.02 * radius
     within_reach = 50 * radius * (b @ w).sqrt().item()
-    assert torch.equal(taken(within_reach, largest_demand=0.8)[0], taken(within_reach)[0])
+    assert torch.equal(
+        taken(within_reach, largest_required_decrease=0.8)[0], taken(within_reach)[0]
+    )
     assert taken(1e4)[1]["case"] == 0
 
 

@@ -143,7 +143,7 @@ TRPO = {"policy_update": {"_target_": "safe_rl.algorithms.TRPOStep", **TRUST_REG
 CPO = {
     "policy_update": {
         "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True,
-        "largest_demand": None,
+        "largest_required_decrease": None,
     }
 }  # fmt: skip
 NUMBERS = {

@@ -26,7 +26,7 @@ def renewals(rows: int, steps: int, generator: torch.Generator):
 
 def test_rate_times_length_is_the_mean_cost_though_length_and_cost_are_correlated():
     generator = torch.Generator().manual_seed(0)
-    estimator = EpisodeCosts(1, max_length=40, drift=None, memory=0.99)
+    estimator = EpisodeCosts(1, max_length=40, drift=None, decay=0.99)
     estimates = []
     for _ in range(60):
         costs, lengths = renewals(20, 200, generator)
@@ -36,7 +36,7 @@ def test_rate_times_length_is_the_mean_cost_though_length_and_cost_are_correlate
 
 def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths():
     costs = torch.rand(3, 12, 2)
-    estimator = EpisodeCosts(2, max_length=100, drift=None, memory=0.0)
+    estimator = EpisodeCosts(2, max_length=100, drift=None, decay=0.0)
     lengths = torch.tensor([4.0, 8.0, 12.0, 6.0, 6.0])
     estimate = estimator.update(costs, lengths)
     torch.testing.assert_close(estimate.mean, costs.sum((0, 1)) / 5)
@@ -63,7 +63,7 @@ def test_the_length_follows_episodes_that_grow_longer_and_shorter_again():
     growing = [50 * 50 ** (index / 40) for index in range(41)]
     falls = [*growing, *[2500.0] * 10, *reversed(growing)]
     truth = torch.tensor(falls) * (1 - (1 - 1 / torch.tensor(falls)) ** 1000)
-    estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
+    estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
     found = []
     for ended in steps_of_a_policy(falls, rows, steps):
         estimator.update(torch.full((rows, steps, 1), 0.05), ended)
@@ -78,7 +78,7 @@ def test_the_length_follows_episodes_that_grow_longer_and_shorter_again():
 
 @pytest.mark.parametrize(("rows", "steps"), [(30, 200), (4, 1000), (7, 130)])
 def test_where_all_episodes_have_one_length_it_is_exact(rows, steps):
-    estimator = EpisodeCosts(1, max_length=1000, drift=None, memory=0.9)
+    estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
     starts = torch.arange(rows) * 991 % 1000
     for batch in range(60):
         ages = starts + batch * steps
@@ -128,7 +128,7 @@ def heaps(generator: torch.Generator, per_step: float = 0.001, size: float = 25.
 def test_costs_that_come_in_heaps_are_not_underestimated():
     # a batch with few heaps shows a small standard error; weighed by it, estimates were 10 % low
     generator = torch.Generator().manual_seed(2)
-    estimator = EpisodeCosts(1, max_length=1000, drift=0.2, memory=0.9, smallest=0.01)
+    estimator = EpisodeCosts(1, max_length=1000, drift=0.2, decay=0.9, smallest=0.01)
     estimates, batches = [], []
     for _ in range(400):
         estimates.append(estimator.update(heaps(generator), torch.empty(0)).mean)
@@ -139,7 +139,7 @@ def test_costs_that_come_in_heaps_are_not_underestimated():
 
 def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
     costs = (torch.rand(4, 50, 1) < 0.2).float() * torch.tensor([1.0, 7.0])
-    estimator = EpisodeCosts(2, max_length=50, drift=0.1, memory=0.9)
+    estimator = EpisodeCosts(2, max_length=50, drift=0.1, decay=0.9)
     assert estimator.unit.tolist() == [1.0, 1.0]
     estimator.update(costs, torch.empty(0))
     assert estimator.unit.tolist() == [1.0, 7.0]

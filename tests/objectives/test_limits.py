@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from safe_rl.algorithms import Constraints
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.objectives import PIDMultiplier, ProjectedMultiplier, RCPOLoss
+from safe_rl.objectives import PIDMultiplier, PIMultiplier, ProjectedMultiplier, RCPOLoss
 from safe_rl.objectives.limits import LimitTracker, PredictedChange
 
 SETTINGS = {
@@ -20,8 +20,8 @@ SETTINGS = {
     "latest_end": 0.7,
     "smallest_scale": 0.01,
     "drift": 0.2,
-    "memory": 0.9,
-    "lowest_trust": 0.1,
+    "decay": 0.9,
+    "lowest_realised_share": 0.1,
     "integral": 0.0,
     "largest_integral": 0.5,
 }
@@ -40,6 +40,7 @@ def batches(number: int, rate: float, seed: int = 0, unit: float = 1.0) -> list[
 
 
 NO_EPISODES = torch.empty(0)
+GAINS = {"init": 0.0, "kp": 1.0, "ki": 0.1, "saturation": 0.5, "highest": 5.0}
 
 
 def test_costs_are_free_then_the_limit_comes_down_from_what_the_policy_costs():
@@ -84,7 +85,7 @@ def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
 
 def test_the_margin_makes_a_batch_exceed_the_limit_as_often_as_z_says():
     z, d = 1.0, 50.0
-    limits = tracker(d, margin=z, free_steps=0, descent_steps=0, memory=0.99, largest_margin=1.0)
+    limits = tracker(d, margin=z, free_steps=0, descent_steps=0, decay=0.99, largest_margin=1.0)
     for costs in batches(500, rate=d / 1000):
         target = limits.update(costs, NO_EPISODES).target
     # a policy that is exactly at its target
@@ -169,7 +170,7 @@ def test_predictions_per_step_are_held_against_the_costs_of_episodes():
 @pytest.mark.parametrize(("kept", "share"), [(-0.5, 0.1), (0.2, 0.2), (0.7, 0.7), (1.5, 1.0)])
 def test_trust_finds_the_share_of_predictions_that_is_realised(kept, share):
     generator = torch.Generator().manual_seed(0)
-    predictions = PredictedChange(1, memory=0.98, lowest=0.1)
+    predictions = PredictedChange(1, decay=0.98, lowest=0.1)
     cost, shares = torch.tensor([400.0]), []
     for step in range(400):
         predicted = -20 * torch.rand(1, generator=generator) * (1 if step % 20 else -15)
@@ -215,3 +216,21 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
     states = [each.update(last, NO_EPISODES) for each in (whole, second)]
     tensors = [[v for v in vars(state).values() if v is not True] for state in states]
     assert all(map(torch.equal, *tensors))
+
+
+def test_another_default_dtype_of_torch_changes_nothing():
+    """As after `torch.set_default_dtype(torch.float64)` in a notebook."""
+    states, steps = [], batches(8, 0.06)
+    for dtype in (torch.float32, torch.float64):
+        torch.set_default_dtype(dtype)
+        try:
+            limits, multiplier = tracker(), PIMultiplier([25.0], **GAINS)
+            for costs in steps:
+                state = limits.update(costs, torch.tensor([90.0]))
+                limits.predictions.record_prediction(torch.tensor([-3.0]))
+                multiplier.update(state)
+        finally:
+            torch.set_default_dtype(torch.float32)
+        states.append([v for v in vars(state).values() if v is not True] + [multiplier.value])
+    assert all(map(torch.equal, *states))
+    assert all(value.dtype == torch.float32 for value in states[1])
