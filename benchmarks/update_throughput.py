@@ -27,6 +27,7 @@ from safe_rl.objectives import (
     CPOLoss,
     CriticLoss,
     LagrangeMultiplier,
+    LimitState,
     PPOLagrangianLoss,
     TRPOLagrangianLoss,
 )
@@ -106,7 +107,7 @@ def main() -> None:
     multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
     trpo = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
     cpo = CPOLoss(actor, entropy_coeff=0.0)
-    violation = torch.tensor([5.0]), torch.tensor(1000.0)
+    limits = LimitState.of(cost=[30.0], limit=[25.0], length=1000.0)
     parameters = {name: value.clone() for name, value in actor.state_dict().items()}
 
     def from_the_start(update: Callable[[], dict]) -> Callable[[], dict]:
@@ -124,9 +125,9 @@ def main() -> None:
     for fraction in (1.0, 0.1):
         step = {"fisher_subsample": fraction, **TRUST_REGION}
         name = "" if fraction == 1.0 else f", fisher_subsample={fraction}"
-        updates[f"TRPO step{name}"] = functools.partial(TRPOStep(trpo, **step), batch)
+        updates[f"TRPO step{name}"] = functools.partial(TRPOStep(trpo, **step), batch, limits)
         updates[f"CPO step{name}"] = functools.partial(
-            CPOStep(cpo, rescale_violation=True, **step), batch, *violation
+            CPOStep(cpo, rescale_violation=True, **step), batch, limits
         )
     print(f"{args.samples} samples, observation size {args.observation_size}, {HIDDEN}, "
           f"{args.threads} threads; median of {args.repeats}")  # fmt: skip

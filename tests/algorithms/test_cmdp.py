@@ -18,7 +18,6 @@ from safe_rl.objectives import (
     LimitState,
     P3OLoss,
     PIDMultiplier,
-    PIMultiplier,
     PPOLagrangianLoss,
     PPOLoss,
     ProjectedMultiplier,
@@ -129,8 +128,7 @@ def p3o(actor, cmdp):
 
 
 def appo(actor, cmdp):
-    gains = {"init": 0.0, "kp": 0.0, "ki": 0.3, "saturation": 1.0, "highest": 10.0}
-    multiplier = PIMultiplier(cmdp.cost_limits, **gains)
+    multiplier = projected_multiplier(cmdp)
     update = ppo_update(APPOLoss(actor, multiplier, sigma=2.0, **PPO), actor)
 
     def update_both(batch, mean_costs):

@@ -24,7 +24,10 @@ def options(group: str) -> list[str]:
 ALGORITHMS = options("algo")
 PAPER = options("algo/paper")
 # those that preset=hard_tasks is for
-WITH_REPLAY = ("cal", "sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac")
+WITH_REPLAY = tuple(
+    name for name in ALGORITHMS if "OffPolicy" in (CONF / "algo" / f"{name}.yaml").read_text()
+    and name != "bc"
+)  # fmt: skip
 CHOICES = [
     *([f"algo={name}"] for name in ALGORITHMS),
     *([f"algo=paper/{name}"] for name in PAPER),

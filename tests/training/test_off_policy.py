@@ -22,7 +22,9 @@ from safe_rl.trust import allow
 
 pytestmark = pytest.mark.long
 
-NAMES = ["sac", "sac_lagrangian", "td3", "td3_lagrangian", "wcsac", "cal"]
+NAMES = [
+    *("sac", "sac_lagrangian", "sac_lagrangian_quantile", "td3", "td3_lagrangian", "wcsac", "cal")
+]
 
 
 @pytest.fixture
