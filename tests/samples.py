@@ -10,8 +10,7 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from safe_rl.objectives import LimitState
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.trust_region import flatten, set_parameters
+from safe_rl.objectives.trust_region import FisherProduct, flatten, set_parameters
 
 NUM_OBS, NUM_ACTIONS = 3, 2
 DELTA = 0.01  # radius of trust regions

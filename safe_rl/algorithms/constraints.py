@@ -15,8 +15,7 @@ from torchrl.envs import EnvBase
 from safe_rl.checks import is_number
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
-from safe_rl.objectives.limit_state import LimitState
-from safe_rl.objectives.limits import LimitTracker
+from safe_rl.objectives.limits import LimitState, LimitTracker
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.risk import PenalisedCosts, RiskMeasure
 from safe_rl.resumable import Resumable

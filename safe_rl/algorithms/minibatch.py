@@ -23,7 +23,7 @@ from torchrl.objectives import LossModule
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import divergence, estimates_read, reported_kl, sum_of_losses
 from safe_rl.checks import Share, Weight, checked
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.policy_projections import CUPLoss
 from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite

@@ -18,11 +18,11 @@ from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import sum_of_losses
 from safe_rl.checks import Fraction
 from safe_rl.objectives.distributions import ReferencePolicy
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.samples import learning_samples, require_finite
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trust_region import (
+    FisherProduct,
     backtracking_search,
     best_in_span,
     conjugate_gradient,

@@ -11,8 +11,7 @@ from safe_rl.objectives.cost_values import CostValues, GaussianCosts, MeanCosts,
 from safe_rl.objectives.critics import CriticLoss
 from safe_rl.objectives.deterministic_losses import BCLoss, TD3LagrangianLoss, TD3Loss
 from safe_rl.objectives.gae import normalise_advantages
-from safe_rl.objectives.limit_state import LimitState
-from safe_rl.objectives.limits import LimitTracker
+from safe_rl.objectives.limits import LimitState, LimitTracker
 from safe_rl.objectives.multipliers import LagrangeMultiplier, Multiplier, ProjectedMultiplier
 from safe_rl.objectives.penalties import APPOLoss, IPOLoss, P3OLoss
 from safe_rl.objectives.policy_losses import (

@@ -11,7 +11,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from safe_rl.checks import Weight
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import CostLimits, FromZero, Multiplier, per_cost
 
 

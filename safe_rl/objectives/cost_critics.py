@@ -13,7 +13,7 @@ from torch import Tensor
 
 from safe_rl.objectives.cost_values import CostValues, MeanCosts
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
 

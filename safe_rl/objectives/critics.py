@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 
 from safe_rl.objectives.gae import gae
-from safe_rl.objectives.samples import require, sample_mask
-from safe_rl.objectives.shared_tensors import SharesTensors
+from safe_rl.objectives.samples import SharesTensors, require, sample_mask
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:

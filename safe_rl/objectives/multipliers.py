@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from safe_rl.checks import Checked
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Interval(gt=0, le=1e6)]

@@ -14,7 +14,7 @@ from torchrl.modules import set_recurrent_mode
 
 from safe_rl.checks import Share, Weight
 from safe_rl.objectives.distributions import has_closed_kl
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.samples import inputs_of
 from safe_rl.objectives.surrogate import WeighsCosts
 

@@ -14,9 +14,8 @@ from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 from safe_rl.checks import Checked
-from safe_rl.objectives.limit_state import LimitState
-from safe_rl.objectives.samples import require, sample_mask
-from safe_rl.objectives.shared_tensors import SharesTensors
+from safe_rl.objectives.limits import LimitState
+from safe_rl.objectives.samples import SharesTensors, require, sample_mask
 
 
 @runtime_checkable

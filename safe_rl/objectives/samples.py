@@ -1,4 +1,4 @@
-"""Reading a batch: entries by key, which samples are padding, and whether all are finite."""
+"""What losses share: reading a batch, and the tensors of their networks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS, LossModule
 
 from safe_rl.naming import key_name, nearest
@@ -125,3 +125,27 @@ def _tensors(
             yield from ((unravel_key((key, name)), x) for name, x in entry.items(True, True))
         elif entry is not None:
             yield key, entry
+
+
+class SharesTensors(LossModule):
+    """Base of losses that share their tensors with their networks, also after a copy or a move.
+
+    A loss of TorchRL stores the parameters and buffers of its networks separately. When it is
+    built, loss and networks share them. After ``copy.deepcopy`` they do not: training the copy
+    would not change its networks. After a move, the networks would have their old buffers.
+    """
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        moved = super()._apply(*args, **kwargs)
+        self._share_tensors()
+        return moved
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._share_tensors()
+
+    def _share_tensors(self) -> None:
+        for name, params in self._modules.items():
+            network = self.__dict__.get(name.removesuffix("_params"))
+            if isinstance(network, nn.Module):
+                params.to_module(network)

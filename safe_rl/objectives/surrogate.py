@@ -20,10 +20,9 @@ from safe_rl.objectives.distributions import (
     kl,
     sampler_of,
 )
-from safe_rl.objectives.limit_state import LimitState
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
-from safe_rl.objectives.samples import inputs_of, require, sample_mask
-from safe_rl.objectives.shared_tensors import SharesTensors
+from safe_rl.objectives.samples import SharesTensors, inputs_of, require, sample_mask
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:

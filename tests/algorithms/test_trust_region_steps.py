@@ -20,9 +20,8 @@ from tensordict import TensorDict
 from safe_rl.algorithms import CPOStep, TRPOStep
 from safe_rl.objectives import CPOLoss, LagrangeMultiplier, TRPOLagrangianLoss, TRPOLoss
 from safe_rl.objectives.distributions import gaussian_kl
-from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.gae import normalise_advantages
-from safe_rl.objectives.trust_region import conjugate_gradient, flatten, policy_in
+from safe_rl.objectives.trust_region import FisherProduct, conjugate_gradient, flatten, policy_in
 
 SETTINGS = TRUST_REGION | {"cg_iterations": 50}
 LENGTH = torch.tensor(100.0)

@@ -24,8 +24,13 @@ from safe_rl.objectives import (
     TRPOLoss,
 )
 from safe_rl.objectives.distributions import ReferencePolicy, entropy, kl
-from safe_rl.objectives.fisher import FisherProduct
-from safe_rl.objectives.trust_region import flatten, mean_kl, policy_in, set_parameters
+from safe_rl.objectives.trust_region import (
+    FisherProduct,
+    flatten,
+    mean_kl,
+    policy_in,
+    set_parameters,
+)
 
 SETTINGS = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
             "max_backtracks": 15}  # fmt: skip

@@ -14,8 +14,8 @@ from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from safe_rl.models import make_actor as make_tanh_actor
-from safe_rl.objectives.fisher import FisherProduct
 from safe_rl.objectives.trust_region import (
+    FisherProduct,
     backtracking_search,
     best_in_span,
     conjugate_gradient,
