@@ -35,6 +35,8 @@ class ConstrainedEnv(EnvBase):
         observation_layout: Columns of every named component of a flat `observation`. If the
             observation is nested, the columns that it would have if it were flat. It has no
             default.
+        privileged_layout: Columns of every named component of the entry `privileged` [N, m], which
+            critics may read and actors never do; empty (the default) if it is not written.
         return_key: Key below "next" of the rewards that returns are computed from.
         events: Names of entries [N, 1] (bool) that say what happened in a step.
         seconds_per_step: Simulated time of a step [s]; None if unknown.
@@ -58,6 +60,7 @@ class ConstrainedEnv(EnvBase):
     observation_layout: Any
     return_key: str = "reward"
     events: tuple[str, ...] = ()
+    privileged_layout: Mapping[str, slice] = {}
     sensor_keys: Mapping[str, Any] = MappingProxyType({})
     seconds_per_step: Any = None
     steps_per_decision: Any = 1

@@ -56,6 +56,7 @@ _COSTS = Key(
 )
 _STEPS = Key(None, Count | None, "steps after which an episode is truncated; null: its own number")
 _ARGUMENTS = Key(None, dict[str, Any] | None, "arguments of its constructor: {g: 9.81}")
+_HIDDEN = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
 _MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
 _COMMON = {"cost_keys": _COSTS, "num_steps": _STEPS, "kwargs": _ARGUMENTS}
 
@@ -84,6 +85,7 @@ FOREIGN = {
         "A Gymnasium environment",
         {
             **_COMMON,
+            "privileged": _HIDDEN,
             "render_mode": _MODE,
             "outside": Key(None, Any, _RANGES),
             "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
@@ -102,6 +104,7 @@ FOREIGN = {
         {
             **_COMMON,
             "observe": Key(None, tuple[Text, ...] | None, "entries; null: `observation` or all"),
+            "privileged": _HIDDEN,
             "flatten": Key(True, bool, "true: several entries become one vector"),
             "outside": Key(None, Any, _RANGES),
             "cost": Key(None, Any, "a function from a step to its cost: my_module:function, or "

@@ -80,6 +80,9 @@ class SimulatedEnv(ConstrainedEnv):
         events = {name: flag.clone() for name in self.flags if name not in ends}
         costs = {key: Bounded(0.0, highest, shape=scalar, **kind) for key in self.cost_keys}
         low, high = (bound.to(torch.float32).expand(*batch, -1) for bound in (low, high))
+        if self.privileged_layout:
+            size = max(columns.stop for columns in self.privileged_layout.values())
+            events["privileged"] = Unbounded(shape=(*batch, size), **kind)
         self.observation_spec = Composite(observation=observation, **events, shape=batch)
         self.action_spec = Bounded(low, high, **kind)
         self.reward_spec = Composite(reward=Unbounded(shape=scalar, **kind), **costs, shape=batch)
@@ -138,6 +141,8 @@ class SimulatedEnv(ConstrainedEnv):
         if self.device != self._physics.device:
             outputs = {key: value.to(self.device) for key, value in outputs.items()}
         outputs["observation"] = self._observe()
+        if self.privileged_layout:
+            outputs["privileged"] = self._observe_privileged()
         # TorchRL's own environments do this too: shapes and devices are right by construction.
         return TensorDict._new_unsafe(outputs, batch_size=self.batch_size, device=self.device)
 
@@ -168,6 +173,10 @@ class SimulatedEnv(ConstrainedEnv):
     @abstractmethod
     def _observe(self) -> Tensor | TensorDict:
         """Return the observation on the device; later steps do not change it."""
+
+    def _observe_privileged(self) -> Tensor:
+        """Return the entry `privileged` on the device, if `privileged_layout` has columns."""
+        raise NotImplementedError
 
     @abstractmethod
     def _read_state(self) -> TensorDict:

@@ -34,6 +34,7 @@ def from_gymnasium(
     seed: int | None = None,
     device: torch.device | str = "cpu",
     flatten: bool = True,
+    privileged: str | None = None,
     **kwargs: Any,
 ) -> GymnasiumEnv:
     """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
@@ -55,6 +56,8 @@ def from_gymnasium(
         device: Device of the TensorDicts.
         flatten: Whether every observation becomes one vector; False keeps pictures and
             dictionaries.
+        privileged: Entry of a dictionary that becomes `privileged` [N, m], which critics may read
+            and actors never do.
         kwargs: Arguments of `gymnasium.make`, if `env` is an id.
 
     Returns:
@@ -74,7 +77,7 @@ def from_gymnasium(
     require_integer("num_envs", num_envs, lowest=1)
     make = _maker(env, kwargs, num_steps)
     keys, length = _describe(make, cost_keys, num_steps, outside)
-    settings = (num_envs, keys, length, outside, flatten, seed, device)
+    settings = (num_envs, keys, length, outside, flatten, privileged, seed, device)
     return _batch(make, *settings, watch=cost_keys is None)
 
 
@@ -85,19 +88,24 @@ def _batch(
     length: int,
     outside: Any,
     flatten: bool,
+    privileged: str | None,
     seed: int | None,
     device: torch.device | str,
     *,
     watch: bool,
 ) -> GymnasiumEnv:
     """Make N environments; with `watch`, there is a warning about costs that are not counted."""
-    make_one = partial(make_adapted, make, length, flatten, keys, watch)
+    # a dictionary keeps its entries until the privileged one is taken out
+    is_vector = flatten and privileged is None
+    make_one = partial(make_adapted, make, length, is_vector, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
-    observed = list(map(dotted, base.observation_spec.keys(True, True)))
+    entries = list(map(dotted, base.observation_spec.keys(True, True)))
+    observed = [name for name in entries if name != privileged]
     base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
     config = {"cost_keys": keys, "outside": outside, "observe": observed, "flatten": flatten}
+    config["privileged"] = privileged
     batch = GymnasiumEnv(base, {**config, "cost": None, "num_steps": length})
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
@@ -183,6 +191,7 @@ def _make_node(
             config["num_steps"],
             config.get("outside"),
             config.get("flatten", True),
+            config.get("privileged"),
             None if seed is None else spread_seed(seed),
             device,
             watch=True,

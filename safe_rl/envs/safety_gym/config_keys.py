@@ -116,6 +116,9 @@ class Keys:
     observe_buttons: Annotated[bool, _LIDAR + "buttons"] = False
     observe_gremlins: Annotated[bool, _LIDAR + "gremlins"] = False
     observe_vision: Annotated[bool, "image of the robot's camera"] = False
+    observe_privileged: Annotated[
+        bool, "an entry `privileged` for critics: costs, and places and velocities of all objects"
+    ] = False
     observe_qpos: Annotated[bool, "positions of joints; a planar root's from its start"] = False
     observe_qvel: Annotated[bool, "velocities of joints"] = False
     observe_ctrl: Annotated[bool, "the last control"] = False

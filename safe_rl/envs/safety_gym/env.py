@@ -29,6 +29,7 @@ from safe_rl.envs.safety_gym.draws import (
 )
 from safe_rl.envs.safety_gym.layouts import plan_placements
 from safe_rl.envs.safety_gym.observations import make_observer, observation_spec
+from safe_rl.envs.safety_gym.privileged import Privileged
 from safe_rl.envs.safety_gym.renderer import WorldRenderer
 from safe_rl.envs.safety_gym.state import (
     OPTIONAL_KEYS,
@@ -52,14 +53,16 @@ class SafetyGymEnv(SimulatedEnv):
 
     Reads `action` [N, nu], clipped to the actuators' control range ([-1, 1] in the suite). Writes
     `observation` [N, n], or nested `("observation", name)` [N, …] where the configuration sets
-    `observation_flatten` False, and each [N, 1]:
+    `observation_flatten` False, with `observe_privileged` also `privileged` [N, m], see
+    `Privileged`, and each [N, 1]:
     `reward`, `cost` (the aggregate), one `cost_<kind>` per constrained kind, `cost_exception`,
     `goal_met`, `done`, `terminated`, `truncated`. Time-outs are truncations. Where the physics of
     a world fails, that world gets `reward_exception`, `cost_exception` 1 and termination.
 
     A state has `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
     `buttons_timer`, `step_count`, and keys that may be missing in a state that is set: `ctrl`,
-    `act`, `history`, `target_quat`, `layout`, `start_pose`, `fixed_layout`, `seed` and `episode`.
+    `act`, `history`, `target_quat`, `layout`, `start_pose`, `fixed_layout`, `seed`, `episode`, and
+    with `observe_privileged` also `last_costs`, `cost_traces` and `since_goal`.
     `set_state` wakes sleeping bodies; with `sleep` False the continuation is identical to the last
     digit.
 
@@ -118,6 +121,10 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured = self._task.measure(self._world).detach().clone()
         self._costs = active_costs(self.config)
         self.cost_keys = ["cost", *(row.key for row in self._costs), EXCEPTION_KEY]
+        self._privileged = None
+        if self.config.observe_privileged:
+            self._privileged = Privileged(self._world, len(self.cost_keys))
+            self.privileged_layout = self._privileged.columns
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._announce(scene.model, observed, highest, seed)
@@ -176,6 +183,8 @@ class SafetyGymEnv(SimulatedEnv):
         key = self._layout_key()
         layouts = self._layouts(key, self._layout_key(ahead=1), mask)
         start_episodes(self._world, layouts, key, mask)
+        if self._privileged is not None:
+            self._privileged.begin(mask)
         put(self._measured, mask, self._task.measure(self._world))
 
     def _observe(self) -> Tensor | TensorDict:
@@ -185,6 +194,10 @@ class SafetyGymEnv(SimulatedEnv):
         return TensorDict(
             self._observer.split(flat), batch_size=self.batch_size, device=self.device
         )
+
+    def _observe_privileged(self) -> Tensor:
+        assert self._privileged is not None
+        return self._privileged.read().to(self.device)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -199,6 +212,8 @@ class SafetyGymEnv(SimulatedEnv):
         torch.gt(costs[0], 0.0, out=self._has_cost)
         world.buttons_timer.sub_(1).clamp_(min=0)
         met, stuck = self._handle_goals(now, failed)
+        if self._privileged is not None:
+            self._privileged.update(costs, met)
         reward = reward + config.reward_goal * met
         reward.masked_fill_(failed, config.reward_exception)
         world.step_count.add_(1)
@@ -258,7 +273,7 @@ class SafetyGymEnv(SimulatedEnv):
 
     def _read_state(self) -> TensorDict:
         world = self._world
-        state = stored_tensors(world)
+        state = stored_tensors(world) | self._remembered()
         state["goal_pos"] = (
             world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
         )
@@ -267,8 +282,11 @@ class SafetyGymEnv(SimulatedEnv):
             state["fixed_layout"] = self._fixed_layout.expand(self.batch_size)
         return TensorDict(state, batch_size=self.batch_size).clone()
 
+    def _remembered(self) -> dict[str, Tensor]:
+        return {} if self._privileged is None else self._privileged.memory
+
     def _write_state(self, state: TensorDictBase) -> None:
-        check_state(self.get_state(), state, OPTIONAL_KEYS)
+        check_state(self.get_state(), state, (*OPTIONAL_KEYS, *self._remembered()))
         button, number = state["goal_button"], self.config.buttons_num
         if goal_is_button(self.config.task) and not ((button >= 0) & (button < number)).all():
             raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
@@ -276,4 +294,6 @@ class SafetyGymEnv(SimulatedEnv):
         if "layout" not in state and not self._episode.any():
             self.reset()
         write_state(self._world, state)
+        for name, tensor in self._remembered().items():
+            tensor.copy_(state.get(name, torch.zeros_like(tensor)))
         self._measured.copy_(self._task.measure(self._world))

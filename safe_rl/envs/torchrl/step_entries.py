@@ -20,7 +20,7 @@ from safe_rl.envs.errors import ConfigError
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import locate
 
-_OBSERVATION = "observation"
+_OBSERVATION, _PRIVILEGED = "observation", "privileged"
 
 
 def entry_key(name: str) -> NestedKey:
@@ -168,7 +168,15 @@ class Observe(Transform):
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
         super().__init__()
-        self._specs = _choose_entries(env.observation_spec, config["observe"])
+        self._privileged = config.get("privileged")
+        self._specs = _choose_entries(env.observation_spec, config["observe"], self._privileged)
+        hidden = (
+            {}
+            if self._privileged is None
+            else {self._privileged: env.observation_spec[entry_key(self._privileged)]}
+        )
+        self.privileged_layout = add_columns({}, {n: _size(s) for n, s in hidden.items()})
+        self._hidden = hidden
         self._flatten = config["flatten"] and len(self._specs) > 1
         pictures = [name for name, spec in self._specs.items() if _is_picture(spec)]
         if self._flatten and pictures:
@@ -178,7 +186,7 @@ class Observe(Transform):
             )
         # what the environment needs for its next step stays where it is
         needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
-        self._moved = [entry_key(name) for name in self._specs if name not in needed]
+        self._moved = [entry_key(n) for n in (*self._specs, *hidden) if n not in needed]
         last = [name.rpartition(".")[2] for name in self._specs]
         self._names = {
             name: name.replace(".", "_") if last.count(end) > 1 else end
@@ -192,6 +200,8 @@ class Observe(Transform):
             for name, spec in self._specs.items()
         }
         after = next_tensordict.exclude(*self._moved)
+        for name, spec in self._hidden.items():
+            after.set(_PRIVILEGED, _numbers(next_tensordict[entry_key(name)], spec))
         if self._flatten:
             return after.set(_OBSERVATION, torch.cat(list(values.values()), -1))
         if len(values) == 1:
@@ -215,6 +225,8 @@ class Observe(Transform):
         for key in self._moved:
             if key in observation_spec.keys(True):
                 del observation_spec[key]
+        for spec in self._hidden.values():
+            observation_spec[_PRIVILEGED] = Unbounded((*shape, _size(spec)), device=device)
         if self._flatten:
             size = sum(map(_size, self._specs.values()))
             observation_spec[_OBSERVATION] = Unbounded((*shape, size), device=device)
@@ -225,19 +237,24 @@ class Observe(Transform):
         return observation_spec
 
 
-def _choose_entries(spec: Composite, wanted: list[str] | None) -> dict[str, TensorSpec]:
-    """Return the specs of the observed entries by their dotted names."""
+def _choose_entries(
+    spec: Composite, wanted: list[str] | None, privileged: str | None
+) -> dict[str, TensorSpec]:
+    """Return the specs of the observed entries, without the privileged one, by dotted names."""
     known = {
         dotted(key): part
         for key, part in spec.items(True, True)
         if not isinstance(part, Composite | NonTensor)
     }
-    for name in wanted or ():
+    named = [("observe", name) for name in wanted or ()]
+    for key, name in named if privileged is None else [*named, ("privileged", privileged)]:
         if name not in known:
             raise ConfigError(
-                f"env.observe: there is no entry '{name}'.{did_you_mean(name, known)} There are "
+                f"env.{key}: there is no entry '{name}'.{did_you_mean(name, known)} There are "
                 f"{', '.join(known)}."
             )
+    if privileged is not None and privileged not in (wanted or ()):
+        del known[privileged]
     below = [name for name in known if name.partition(".")[0] == _OBSERVATION]
     chosen = wanted or below or [name for name in known if "." not in name]
     if not chosen:

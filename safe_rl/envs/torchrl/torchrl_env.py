@@ -62,6 +62,7 @@ class TorchRLEnv(ConstrainedEnv, TransformedEnv):
         super().__init__(base_env, Compose(costs, *others, *_plain_actions(base_env), observe))
         self.cost_keys = costs.names
         self.observation_layout = observe.layout
+        self.privileged_layout = observe.privileged_layout
         self.max_episode_steps = int(config["num_steps"])
 
     @property

@@ -41,6 +41,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
         self.reuses_tensors = base_env.reuses_tensors
+        self.privileged_layout = base_env.privileged_layout
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours.items():
             try:
