@@ -223,7 +223,11 @@ def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
             return complete_foreign(family, node)
     keys = {key: value for key, value in node.items() if key not in ("name", "_target_")}
     resolvers: dict[Any, Callable[..., Any]] = {None: resolve, VELOCITY_TARGET: resolve_velocity}
-    return {**env_node(resolvers[target](keys)), **node} if target in resolvers else dict(node)
+    if target not in resolvers:
+        return dict(node)
+    config = resolvers[target](keys)
+    is_complete = target is None and KEYS.keys() <= node.keys()
+    return dict(node) if is_complete else {**env_node(config), **node}
 
 
 def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig | VelocityConfig) -> None:
@@ -262,16 +266,16 @@ def store_configs() -> None:
     text = {"name": Key(SAFETY_GYM, Text)}
     ConfigStore.instance().store(SAFETY_GYM, structured("SafetyGym", text | KEYS), GROUP)
     for name, keys in (SUITE | EXTRAS | _STORED).items():
-        head = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
-        ConfigStore.instance().store(name, {**head, "name": name, **_lists(keys)}, GROUP)
+        base = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
+        ConfigStore.instance().store(name, {**base, "name": name, **_lists(keys)}, GROUP)
     for name, row in VELOCITY_SUITE.items():
         values = {"_target_": VELOCITY_TARGET, "name": name, **row}
         keys = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
         ConfigStore.instance().store(name, structured(name, keys), GROUP)
     for name, family in FOREIGN.items():
         head = {"_target_": family.target, "name": "${.id}", "id": "???"}
-        keys = {key: Key(value, str) for key, value in head.items()} | family.keys
-        ConfigStore.instance().store(name, structured(name, keys), GROUP)
+        rows = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
+        ConfigStore.instance().store(name, structured(name, rows), GROUP)
 
 
 # `Safexp-{name}-v0`, and `Safexp-Custom-v0` with the default of every key. They take a `config`

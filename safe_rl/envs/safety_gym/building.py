@@ -80,7 +80,8 @@ def _compile(config: SafetyGymConfig, content: str, sleep: bool, decorated: bool
             "If a size is wrong, correct the Geoms of your elements."
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
-    scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
+    if any(factor != 1.0 for factor in scales.values()):
+        scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
     return _index(config, model, robot, present, guided, placed, contact_names)
 
 

@@ -158,7 +158,11 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
     KEYS.update({**_BUILT_IN, **keys})
     added = [(name, Any, field(default=row.default)) for name, row in keys.items()]
     _extended = make_dataclass(
-        *("SafetyGymConfig", added),
+        "SafetyGymConfig",
+        added,
         bases=(SafetyGymConfig,),
-        **{"frozen": True, "kw_only": True, "eq": False, "repr": False},
+        frozen=True,
+        kw_only=True,
+        eq=False,
+        repr=False,
     )

@@ -121,10 +121,11 @@ class SafetyGymEnv(SimulatedEnv):
         self._measured = self._task.measure(self._world).detach().clone()
         self._costs = active_costs(self.config)
         self.cost_keys = ["cost", *(row.key for row in self._costs), EXCEPTION_KEY]
-        self._privileged = None
+        self._privileged, self._remembered = None, dict[str, Tensor]()
         if self.config.observe_privileged:
             self._privileged = Privileged(self._world, len(self.cost_keys))
             self.privileged_layout = self._privileged.columns
+            self._remembered = self._privileged.memory
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._announce(scene.model, observed, highest, seed)
@@ -273,7 +274,7 @@ class SafetyGymEnv(SimulatedEnv):
 
     def _read_state(self) -> TensorDict:
         world = self._world
-        state = stored_tensors(world) | self._remembered()
+        state = stored_tensors(world) | self._remembered
         state["goal_pos"] = (
             world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
         )
@@ -282,11 +283,8 @@ class SafetyGymEnv(SimulatedEnv):
             state["fixed_layout"] = self._fixed_layout.expand(self.batch_size)
         return TensorDict(state, batch_size=self.batch_size).clone()
 
-    def _remembered(self) -> dict[str, Tensor]:
-        return {} if self._privileged is None else self._privileged.memory
-
     def _write_state(self, state: TensorDictBase) -> None:
-        check_state(self.get_state(), state, (*OPTIONAL_KEYS, *self._remembered()))
+        check_state(self.get_state(), state, (*OPTIONAL_KEYS, *self._remembered))
         button, number = state["goal_button"], self.config.buttons_num
         if goal_is_button(self.config.task) and not ((button >= 0) & (button < number)).all():
             raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
@@ -294,6 +292,6 @@ class SafetyGymEnv(SimulatedEnv):
         if "layout" not in state and not self._episode.any():
             self.reset()
         write_state(self._world, state)
-        for name, tensor in self._remembered().items():
+        for name, tensor in self._remembered.items():
             tensor.copy_(state.get(name, torch.zeros_like(tensor)))
         self._measured.copy_(self._task.measure(self._world))

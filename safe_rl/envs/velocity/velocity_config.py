@@ -93,6 +93,9 @@ Interval = Annotated[
 ]
 
 
+_OF_ROBOT: Any = None  # replaced by the default of the robot, which every robot has
+
+
 @dataclass(frozen=True, kw_only=True)
 class VelocityConfig:
     """Everything that defines one environment; keys that its robot does not have are None.
@@ -111,28 +114,26 @@ class VelocityConfig:
     """
 
     robot: Annotated[str, "the robot"] = ""
-    velocity_threshold: Annotated[NotNegative | None, "speed above which a step costs 1 [m/s]"] = (
-        None
-    )
+    velocity_threshold: Annotated[NotNegative, "speed above which a step costs 1 [m/s]"] = None
     num_steps: Annotated[Count, "steps after which an episode is truncated"] = 1000
-    frame_skip: Annotated[Count | None, "substeps per step"] = None
+    frame_skip: Annotated[Count, "substeps per step"] = _OF_ROBOT
     # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
     mass_scale: Annotated[Positive, "factor on masses and inertias"] = 1.0
     friction_scale: Annotated[Positive, "factor on the friction of all surfaces"] = 1.0
     damping_scale: Annotated[NotNegative, "factor on the damping of joints"] = 1.0
     strength_scale: Annotated[NotNegative, "factor on the forces of actuators"] = 1.0
     reset_noise_scale: Annotated[
-        NotNegative | None, "noise of initial positions [m, rad] and velocities [m/s, rad/s]"
-    ] = None
+        NotNegative, "noise of initial positions [m, rad] and velocities [m/s, rad/s]"
+    ] = _OF_ROBOT
     exclude_current_positions_from_observation: Annotated[bool, "hide the root's place"] = True
-    include_cinert_in_observation: Annotated[bool | None, "observe masses and inertias"] = None
+    include_cinert_in_observation: Annotated[bool | None, "observe masses and inertias"] = _OF_ROBOT
     include_cvel_in_observation: Annotated[bool | None, "observe the velocities of bodies"] = None
     include_qfrc_actuator_in_observation: Annotated[bool | None, "observe actuator forces"] = None
     include_cfrc_ext_in_observation: Annotated[bool | None, "observe contact forces"] = None
 
     # reward
-    forward_reward_weight: Annotated[Number | None, "reward per m/s"] = None
-    ctrl_cost_weight: Annotated[Number | None, "loss of reward per squared control"] = None
+    forward_reward_weight: Annotated[Number, "reward per m/s"] = _OF_ROBOT
+    ctrl_cost_weight: Annotated[Number, "loss of reward per squared control"] = _OF_ROBOT
     contact_cost_weight: Annotated[Number | None, "the same per squared force [N², N²m²]"] = None
     contact_cost_range: Annotated[Interval | None, "range of the weighted sum"] = None
     contact_force_range: Annotated[Interval | None, "range of every force [N, N m]"] = None
