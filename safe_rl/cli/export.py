@@ -64,7 +64,7 @@ def _choose_actions(run: Run, checkpoint: Path, asked: str) -> bool:
     """Whether the exported policy samples: as it was certified, unless the user asks otherwise."""
     from safe_rl.evaluation.policies import is_sampled
 
-    certificate = run.certificate if checkpoint.parent.name == "certified" else None
+    certificate = run.certificate_of(checkpoint)
     if certificate is None:
         return asked == "sampled"
     certified = "sampled" if is_sampled(certificate) else "mean"

@@ -35,7 +35,6 @@ from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded
 from safe_rl.runs.curves import Figure, learning_curves
-from safe_rl.runs.display import outcome_line
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
@@ -268,13 +267,13 @@ class Run(RecordedRun):
         """Its learning curves, a Matplotlib figure: return, costs, cost rates and multipliers."""
         length = self.env.max_episode_steps
         title = f"{self.environment} {self.algorithm} seed {self.seed}"
-        return learning_curves(self.table, self.cost_limits, length, title)
+        return learning_curves(self.table, self.cost_limits, length, title, self.measure)
 
     def __repr__(self) -> str:
         """Algorithm, environment, outcome and certificate."""
         lines = [f"Run({str(self.directory)!r}): {self.algorithm} on {self.environment}"]
         if self.num_rows:
-            lines.append(outcome_line(self.table, self.cost_limits, self.episode_length or 1000))
+            lines.append(self.outcome)
         if (found := self.certificate) is not None:
             shown = found["bounds"] if found["certified"] else {}
             bounds = [f"{name} ≤ {rounded_up(b['bound']):.3g}" for name, b in shown.items()]

@@ -59,10 +59,9 @@ def read_resumed(
 def _read(directory: Path) -> dict[str, Any]:
     run = Run(directory)
     try:
-        run.check_is_run()
+        config = dict(run.settings)
         if run.checkpoints_folder.exists() and not run.has_begun:
             raise ValueError("it has no progress.csv: an exported policy cannot be trained on")
-        config = read_config(run.config_file)
         for key in ("hydra", "defaults"):
             if key in config:
                 raise ValueError(f"{run.config_file.name} has the key '{key}', which no run writes")

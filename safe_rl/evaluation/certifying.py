@@ -22,6 +22,7 @@ from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_la
 from safe_rl.evaluation.measuring import Trial
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, read_json, replace_json, replacing
+from safe_rl.runs.checkpoints import policy_hash
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
 from safe_rl.scores.certificate import Claim, error_of_next_test, first_certified, rank
@@ -104,6 +105,7 @@ def certify(
         )
     certificate = replace(certificate, checkpoint=_keep(run, certificate.checkpoint))
     _write(run, certificate, [checkpoint_steps(path) for path in candidates])
+    _remove_earlier(run, certificate.checkpoint)
     return certificate
 
 
@@ -235,33 +237,38 @@ def _side_by_side(policies: list[TensorDictModuleBase]) -> Callable[..., TensorD
 
 
 def _keep(run: Run, checkpoint: Path | None) -> Path | None:
-    """Copy the certified checkpoint to a file that is not overwritten by later ones.
-
-    The checkpoint of an earlier certificate is deleted only when the copy is complete: copying a
-    checkpoint with a replay buffer takes long enough to be interrupted.
-    """
-    directory = run.checkpoints_folder / "certified"
+    """Copy the certified checkpoint to a file that is not overwritten by later ones."""
     if checkpoint is None:
-        if directory.is_dir() and not (run.checkpoints("best") or run.checkpoints("last")):
-            directory.rename(directory.with_name("last"))  # an exported policy's only weights
-        shutil.rmtree(directory, ignore_errors=True)
         return None
-    directory.mkdir(parents=True, exist_ok=True)
-    kept = directory / checkpoint.name
+    kept = run.checkpoints_folder / "certified" / checkpoint.name
+    kept.parent.mkdir(parents=True, exist_ok=True)
     with replacing(kept) as unfinished:
         shutil.copy2(checkpoint, unfinished)
-    for other in directory.iterdir():
-        if other != kept:
-            other.unlink()
     return kept
 
 
+def _remove_earlier(run: Run, kept: Path | None) -> None:
+    """Remove earlier certified checkpoints, once the new certificate is complete.
+
+    Until then the old certificate has its policy: copying one with a replay buffer takes long
+    enough to be interrupted.
+    """
+    earlier = [path for path in run.checkpoints("certified") if path != kept]
+    if earlier and kept is None and not (run.checkpoints("best") or run.checkpoints("last")):
+        # an exported policy's only weights
+        earlier[0].parent.rename(run.checkpoints_folder / "last")
+        return
+    for path in earlier:
+        path.unlink()
+
+
 def _write(run: Run, certificate: Certificate, candidates: list[int | None]) -> None:
-    verdict, options = certificate.verdict, certificate.options
+    verdict, options, kept = certificate.verdict, certificate.options, certificate.checkpoint
     content = asdict(verdict) | asdict(options)
     content |= {
-        "certified": certificate.checkpoint is not None,
-        "checkpoint": None if certificate.checkpoint is None else certificate.checkpoint.name,
+        "certified": kept is not None,
+        "checkpoint": None if kept is None else kept.name,
+        "policy_sha256": None if kept is None else policy_hash(kept),
         "episode_return": certificate.episode_return,
         "means": dict(certificate.means),
         "further_episodes": certificate.further,

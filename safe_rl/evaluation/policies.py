@@ -76,7 +76,7 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     if any(folder.glob("*")) and not is_exported:
         raise FileExistsError(f"{folder} has other files: give a new folder for the policy.")
     steps = checkpoint_steps(path)
-    is_certified = path.parent.name == "certified"
+    is_certified = source.certificate_of(path) is not None
     kept = target.checkpoint_file("certified" if is_certified else "last", steps or 0)
     for former in (target.checkpoints_folder, target.robot_folder):
         shutil.rmtree(former, ignore_errors=True)
@@ -210,7 +210,7 @@ def describe(directory: Path, checkpoint: Path, *, sampled: bool) -> dict[str, A
         sampled: Whether its actions are sampled when it is used.
     """
     run = Run(directory)
-    found = run.certificate if checkpoint.parent.name == "certified" else None
+    found = run.certificate_of(checkpoint)
     covers = found is not None and is_sampled(found) == sampled
     kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
     return {

@@ -27,7 +27,6 @@ from safe_rl.reporting.tables import clean, read_certificate, read_code, read_ev
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import differences, role_of
-from safe_rl.runs.outcome import judges_another_measure
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -128,10 +127,6 @@ class Run(folders.Run):
     def code_text(self) -> str | None:
         """The version and commit of its code, see `read_code`, or None."""
         return read_code(self.notes["code"]) if "code" in self.notes else None
-
-    def limits_another_measure(self, key: str) -> bool:
-        """Whether the limit of a cost is on another measure than the mean cost of an episode."""
-        return judges_another_measure(self.table, key, self.cost_limits[key])
 
 
 def select(node: Any, *keys: str) -> Any:

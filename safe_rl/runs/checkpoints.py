@@ -10,9 +10,12 @@ import math
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
@@ -45,6 +48,31 @@ def read_states(path: Path, names: Collection[str] | None = None) -> dict[str, A
     if missing := sorted(set(names) - set(parts)):
         raise CheckpointError(f"The checkpoint {path} has no {' and no '.join(missing)}.")
     return {name: parts[name] for name in names}
+
+
+def policy_hash(path: Path) -> str:
+    """SHA-256 of the trained actor in a checkpoint; of a policy without one, of all its parts.
+
+    An exported policy has the same hash as the checkpoint from which it comes.
+    """
+    parts = _read(path, lazy=True)["parts"]
+    tensors = flatten_tensors(parts.get("actor", parts))
+    digest = sha256()
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def flatten_tensors(state: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
+    """All tensors of nested dictionaries by dotted names."""
+    found: dict[str, Tensor] = {}
+    for name, value in state.items():
+        if isinstance(value, Mapping):
+            found |= flatten_tensors(value, f"{prefix}{name}.")
+        elif isinstance(value, Tensor):
+            found[f"{prefix}{name}"] = value
+    return found
 
 
 def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
@@ -187,8 +215,12 @@ class CheckpointStore:
         return True
 
     def _remove_worse(self, after: str = "") -> None:
-        """Remove the best checkpoints beyond ``keep_best`` that are newer than a named one."""
-        ranked = sorted(checkpoints_in(self.best), key=_score, reverse=True)
+        """Remove the best checkpoints beyond ``keep_best`` that are newer than a named one.
+
+        One that cannot be read may be the best, so it stays for the user to look at.
+        """
+        readable = (path for path in checkpoints_in(self.best) if _score(path) > -math.inf)
+        ranked = sorted(readable, key=_score, reverse=True)
         for worse in ranked[self._keep_best :]:
             if worse.name > after:
                 worse.unlink()

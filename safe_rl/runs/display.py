@@ -1,7 +1,7 @@
 """Output on the terminal: a progress bar during training, and a line at the end.
 
 `limits` are d, the undiscounted cost allowed per episode, by cost key. `episode_length` is the
-largest number of steps of an episode.
+largest number of steps of an episode. `measure` names the limited measure of episode costs.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class ProgressBar:
         begun: int,
         limits: Mapping[str, float],
         episode_length: int,
+        measure: str = "mean",
     ) -> None:
         self._name = os.path.relpath(directory)
         self._seconds = float(os.environ.get(LINE_SECONDS, "inf"))
@@ -49,10 +50,11 @@ class ProgressBar:
             smoothing=0.1, **options,
         )  # fmt: skip
         self._limits, self._episode_length = limits, episode_length
+        self._measure = measure
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, given as its row of the table."""
-        figures = shown(row, self._limits, self._episode_length)
+        figures = shown(row, self._limits, self._episode_length, self._measure)
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
         if monotonic() - self._printed >= self._seconds:
@@ -71,6 +73,7 @@ def shown(
     row: Mapping[str, float],
     limits: Mapping[str, float],
     episode_length: int = _RATE_STEPS,
+    measure: str = "mean",
 ) -> dict[str, str]:
     """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
 
@@ -97,7 +100,7 @@ def shown(
     else:
         unit, scale = "", 1.0
         figures["return"] = f"{row['episode_return']:.2f}"
-        values = {key: measured(row, key, limits.get(key)) for key in costs}
+        values = {key: measured(row, key, limits.get(key), measure) for key in costs}
     for key, value in values.items():
         figures[f"{key}{unit}"] = f"{value:.1f}{_present_limit(row, key, limits, scale)}"
     multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
@@ -121,7 +124,10 @@ def _present_limit(
 
 
 def outcome_line(
-    table: Mapping[str, Sequence[float]], limits: Mapping[str, float], episode_length: int
+    table: Mapping[str, Sequence[float]],
+    limits: Mapping[str, float],
+    episode_length: int,
+    measure: str = "mean",
 ) -> str:
     """One line about the end of a run: return and costs over its last epochs.
 
@@ -140,7 +146,7 @@ def outcome_line(
     if rows:
         begin = 0 if rows[0] == 0 else table["steps"][rows[0] - 1]
         what = f"Return {final['episode_return']:.2f}"
-        values = {key: _final_cost(final, key, limits.get(key)) for key in keys}
+        values = {key: _final_cost(final, key, limits.get(key), measure) for key in keys}
         over = f"per episode, mean of steps {begin + 1:,.0f} to {table['steps'][rows[-1]]:,.0f}"
         scale = 1.0
     else:
@@ -156,7 +162,7 @@ def outcome_line(
     return f"{what} {over}; {final['steps_per_second']:,.0f} steps/s"
 
 
-def _final_cost(final: Mapping[str, float], key: str, limit: float | None) -> str:
-    mean, own = final[f"episode_{key}"], measured(final, key, limit)
+def _final_cost(final: Mapping[str, float], key: str, limit: float | None, measure: str) -> str:
+    mean, own = final[f"episode_{key}"], measured(final, key, limit, measure)
     differs = abs(own - mean) > 0.05
     return f"{mean:.1f}" + (f", limited measure {own:.1f}" if differs else "")

@@ -48,7 +48,7 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
     """
 
     def __init__(self, exp_name: Text, log_dir: str) -> None:
-        if Path(exp_name).name != exp_name:
+        if Path(exp_name).name != exp_name or exp_name == "..":
             raise ValueError(f"logger.exp_name={exp_name}: it names a folder in that of the run.")
         super().__init__(exp_name, log_dir)
 

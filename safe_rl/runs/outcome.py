@@ -34,14 +34,23 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
     return row[f"episode_{key}"] - limit if math.isnan(own) else own
 
 
-def measured(row: Mapping[str, float], key: str, limit: float | None) -> float:
+def measured(row: Mapping[str, float], key: str, limit: float | None, measure: str) -> float:
     """The measure that is compared with a limit; without a limit, the mean episode cost.
 
+    Args:
+        row: An epoch.
+        key: The cost.
+        limit: Its limit, or None.
+        measure: Name of the measure, see `safe_rl.runs.run.measure_of`.
+
     Examples:
-        >>> measured({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
-        87.0
+        >>> row = {"episode_cost": 30.0, "violation_cost": 62.0}
+        >>> measured(row, "cost", 25.0, "CVaR"), measured(row, "cost", 25.0, "mean")
+        (87.0, 30.0)
     """
-    return row[f"episode_{key}"] if limit is None else limit + violation(row, key, limit)
+    if limit is None or measure == "mean":
+        return row[f"episode_{key}"]
+    return limit + violation(row, key, limit)
 
 
 def keeps(row: Mapping[str, float], key: str, limit: float) -> bool:
@@ -85,24 +94,6 @@ def feasible_return(
     is_feasible = all(keeps(mean, key, limit) for key, limit in limits.items())
     score = mean["episode_return"]
     return score if is_feasible and not math.isnan(score) else None
-
-
-def judges_another_measure(table: Mapping[str, Sequence[float]], key: str, limit: float) -> bool:
-    """Whether the limit of a cost is on another measure than the mean cost of an episode.
-
-    Examples:
-        >>> table = {"episode_cost": [30.0, 20.0], "violation_cost": [5.0, -5.0]}
-        >>> judges_another_measure(table, "cost", 25.0)
-        False
-        >>> judges_another_measure(table | {"violation_cost": [5.0, 40.0]}, "cost", 25.0)
-        True
-    """
-    costs = table.get(f"episode_{key}", ())
-    # columns may come from single precision
-    return any(
-        abs(own - (cost - limit)) > 1e-4 * (1 + abs(cost) + abs(limit))
-        for own, cost in zip(table.get(f"violation_{key}", ()), costs, strict=False)
-    )
 
 
 def final_width(steps: Iterable[float]) -> int:

@@ -6,7 +6,6 @@ their names.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -17,8 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.checks import is_number
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
+from safe_rl.runs.display import outcome_line
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
-from safe_rl.runs.outcome import final_figures, violation
+from safe_rl.runs.outcome import final_figures, measured
 from safe_rl.runs.table import MOST_BYTES, read_table
 
 KINDS = ("last", "best", "certified")
@@ -132,6 +132,9 @@ class Run:
             return Path(which)
         from safe_rl.runs.checkpoints import best_checkpoint  # it needs torch
 
+        if which == "certified":
+            return self._certified()
+
         # the newest one, even if it cannot be read: an older one must not silently replace it
         found = {kind: self.newest_checkpoint(kind) for kind in KINDS}
         found["best"] = best_checkpoint(self.checkpoints_folder / "best")
@@ -150,6 +153,34 @@ class Run:
                 f"{self.directory} has no {which} checkpoint: {reason[which]}.{hint}"
             )
         return path
+
+    def _certified(self) -> Path:
+        """The checkpoint that the certificate is about."""
+        name = (self.certificate or {}).get("checkpoint")
+        path = self.checkpoints_folder / "certified" / Path(str(name)).name
+        if name is not None and self.certificate_of(path) is not None:
+            return path
+        if name is None or not path.exists():
+            reason = "none of its policies has been certified"
+            other = next((kind for kind in KINDS[:2] if self.checkpoints(kind)), None)
+            hint = f" Use checkpoint={other}." if other else ""
+            raise FileNotFoundError(
+                f"{self.directory} has no certified checkpoint: {reason}.{hint}"
+            )
+        raise ValueError(
+            f"{path} is not the policy that {Run.certificate_file.name} is about: certify it again."
+        )
+
+    def certificate_of(self, checkpoint: Path) -> dict[str, Any] | None:
+        """The certificate if it is about the policy in this file; None otherwise."""
+        content = self.certificate or {}
+        certified = self.checkpoints_folder / "certified" / str(content.get("checkpoint"))
+        if not checkpoint.is_file() or checkpoint.resolve() != certified.resolve():
+            return None
+        from safe_rl.runs.checkpoints import policy_hash  # it needs torch
+
+        expected = content.get("policy_sha256")
+        return content if expected in (None, policy_hash(checkpoint)) else None
 
     @property
     def evaluation_files(self) -> list[Path]:
@@ -288,16 +319,31 @@ class Run:
         """Final J_r (``episode_return``), J_c (``episode_<cost>``) and ρ_c (``<cost>_rate``)."""
         return self.figures(list(self.cost_limits) or ["cost"])
 
+    @property
+    def outcome(self) -> str:
+        """One line about its end: return and costs over its last epochs."""
+        return outcome_line(self.table, self.cost_limits, self.episode_length or 1000, self.measure)
+
     def excess(self, key: str) -> float:
-        """Violation of a cost's limit, a mean over the last epochs; negative within it."""
-        return violation(self.figures([key]), key, self.cost_limits[key])
+        """Excess of the limited measure over its limit, a mean over the last epochs."""
+        limit = self.cost_limits[key]
+        return measured(self.figures([key]), key, limit, self.measure) - limit
+
+    def limits_another_measure(self, key: str) -> bool:
+        """Whether the limit of a cost is on another measure than the mean cost of an episode."""
+        return self.measure != "mean" and f"violation_{key}" in self.table
 
     # certificate, evaluations, code
 
     @_Reread
     def certificate(self) -> dict[str, Any] | None:
         """The content of ``certificate.json``, or None if there is no such file."""
-        return read_json(self.certificate_file) if self.certificate_file.is_file() else None
+        if not self.certificate_file.is_file():
+            return None
+        content = read_json(self.certificate_file)
+        if not isinstance(content, dict):
+            raise ValueError(f"{self.certificate_file} is not as a run writes it.")
+        return content
 
     @_Reread
     def evaluations(self) -> list[dict[str, Any]]:
@@ -308,14 +354,6 @@ class Run:
     def code(self) -> list[dict[str, Any]] | None:
         """The versions of the code that it used, with their first steps; None if not recorded."""
         return read_json(self.code_file) if self.code_file.is_file() else None
-
-    def command(self, *folders: str) -> str | None:
-        """The command that repeats it, or None if its overrides are not recorded."""
-        if self.overrides is None:
-            return None
-        return shlex.join(
-            ["python", "train.py", *(f"--config-dir={path}" for path in folders), *self.overrides]
-        )
 
 
 def find_runs(root: Path, most: int | None = None) -> list[Run]:

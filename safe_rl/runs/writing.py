@@ -19,7 +19,7 @@ from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings
 from safe_rl.runs.outcome import final_figures
-from safe_rl.runs.run import Run
+from safe_rl.runs.run import Run, measure_of
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.trust import instantiate
 
@@ -53,7 +53,7 @@ class RunWriter:
         self.run, self.directory = run, run.directory
         self._config = config
         self._cost_limits = dict(cost_limits)
-        self._episode_length = episode_length
+        self._episode_length, self._measure = episode_length, measure_of(config)
 
     @contextmanager
     def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
@@ -91,7 +91,7 @@ class RunWriter:
             batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch
             self._bar = ProgressBar(
-                self.directory, total, steps, self._cost_limits, self._episode_length
+                self.directory, total, steps, self._cost_limits, self._episode_length, self._measure
             )
             opened.callback(self._bar.close)
             yield
@@ -141,7 +141,9 @@ class RunWriter:
         table, config = read_table(self.run.table_file), self._config
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
         try:
-            figure = learning_curves(table, self._cost_limits, self._episode_length, title)
+            figure = learning_curves(
+                table, self._cost_limits, self._episode_length, title, self._measure
+            )
             save_figure(figure, self.run.curves_file)
         except (OSError, RuntimeError, ValueError) as error:  # such as text.usetex without LaTeX
             reason = " ".join(str(error).split())
@@ -150,7 +152,7 @@ class RunWriter:
     def summary(self) -> str:
         """One line about the end of the run."""
         table = read_table(self.run.table_file)
-        line = outcome_line(table, self._cost_limits, self._episode_length)
+        line = outcome_line(table, self._cost_limits, self._episode_length, self._measure)
         return f"{line}; {self.directory}"
 
 

@@ -142,7 +142,7 @@ def begin_from(
         )
     if interface is not None:
         check_interface(checkpoint, interface)
-    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), _estimated(config))
+    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), estimated(config))
     taken = {
         name: network
         for name, network in algorithm.networks.items()
@@ -168,13 +168,16 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], tuple[Any, Any]]:
     config = run.settings if run.is_run else {}
     is_constrained = (config.get("algo") or {}).get("constrained", False)
     costs = list(config.get("cost_limits", {})) if is_constrained else []
-    return costs, _estimated(config)
+    return costs, estimated(config)
 
 
-def _estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
+def estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
     """What decides which measure cost critics estimate: the risk, and the loss of Q functions."""
     loss = (config.get("loss") or {}).get("_target_") if config.get("critics") else None
-    return (config.get("risk") or {}).get("_target_"), loss
+    risk = config.get("risk") or {}
+    # with risk=mean the section may still have numbers
+    read = ("_target_", "tail", "most_over") if risk.get("_target_") else ()
+    return {key: risk.get(key) for key in read}, loss
 
 
 def _check_shapes(

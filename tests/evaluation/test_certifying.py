@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -73,6 +74,39 @@ def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
     student = certify(directory, replace(OPTIONS, bound="student"), make_env=make_env)
     assert "assumes that no rare episodes cost far more" in str(student)
     assert "test 2 of this run; the level is that of all its tests" in str(student)
+
+
+def test_a_certificate_is_about_the_policy_beside_it_whenever_it_is_interrupted(train, monkeypatch):
+    directory = train("{cost: 19}")
+    run = Run(directory)
+    first = certify(directory, OPTIONS, make_env=make_env).checkpoint
+    other = next(path for path in run.checkpoints("last") if path.name != first.name)
+
+    def kill(*arguments):
+        raise KeyboardInterrupt
+
+    def certify_other():
+        certificate = Certificate(other, 1.0, Verdict(0, [0], {}, {}, [], {}, 9), OPTIONS)
+        certifying._keep(run, other)
+        certifying._write(run, certificate, [0])
+        certifying._remove_earlier(run, other)
+
+    for step in ("_write", "_remove_earlier"):
+        with monkeypatch.context() as patch:
+            patch.setattr(certifying, step, kill)
+            with pytest.raises(KeyboardInterrupt):
+                certify_other()
+        name = run.certificate["checkpoint"]
+        assert run.find_checkpoint("certified").name == name
+    assert (first.name, other.name) == (first.name, name)
+    # another policy under the certified name, in the folder or as a file that is named
+    shutil.copy(run.checkpoints("last")[0], run.find_checkpoint("certified"))
+    shutil.copy(first, run.checkpoints_folder / "certified" / other.name)
+    with pytest.raises(ValueError, match="is not the policy that certificate"):
+        run.find_checkpoint("certified")
+    assert run.certificate_of(run.checkpoints_folder / "certified" / other.name) is None
+    with pytest.raises(ValueError, match="is not the policy that certificate"):
+        pack_policy(directory, directory.parent / "exported")
 
 
 def test_tests_of_a_run_spend_its_error_once_each(train):
@@ -350,7 +384,7 @@ def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_js
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
-    _write(Run(tmp_path), certificate, [100])
+    _write(Run(tmp_path), replace(certificate, checkpoint=None), [100])
     content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
     assert content["bounds"]["mean_cost"] == {"bound": None, "most": 25.0}
     assert (content["episodes"], content["most_episodes"]) == (700, 120)

@@ -65,7 +65,8 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
 
 
 def test_only_a_certified_policy_is_packed_as_certified(run, tmp_path):
-    (run / "certificate.json").write_text('{"certified": true}')
+    name = next((run / "checkpoints/last").iterdir()).name
+    (run / "certificate.json").write_text(json.dumps({"certified": True, "checkpoint": name}))
     packed = tmp_path / "packed"
     for kind, which in (("last", ()), ("certified", ()), ("last", ("checkpoint=last",))):
         assert export([str(run), str(packed), *which]) == 0
@@ -170,6 +171,7 @@ def test_an_exported_policy_acts_in_the_environment_itself(family, algo, tmp_pat
 def certified(run, deterministic):
     shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified", dirs_exist_ok=True)
     content = {"certified": True, "deterministic": deterministic, "level": 0.95, "bounds": {}}
+    content["checkpoint"] = next((run / "checkpoints/last").iterdir()).name
     (run / "certificate.json").write_text(json.dumps(content))
 
 

@@ -171,7 +171,8 @@ def test_an_evaluation_shows_every_limit(tmp_path):
 
 def test_evaluations_are_told_apart_by_their_names(tmp_path):
     # of the mean: training limited something else; of the share: a few of many are not none
-    directory = write_run(tmp_path, columns={"violation_cost": [3.0]})
+    risk = {"_target_": "safe_rl.objectives.CVaR"}
+    directory = write_run(tmp_path, columns={"violation_cost": [3.0]}, risk=risk)
     changes = {"episode_cost": _estimate(90.0), "over_limit_cost": _estimate(0.004)}
     estimates = {**EVALUATION["estimates"], **changes}
     for name in ("", "many"):

@@ -66,6 +66,10 @@ def test_several_best_ones_are_those_with_the_highest_scores(tmp_path):
     assert checkpoint_steps(best_checkpoint(store.best)) == 5
     (store.best / "checkpoint-000000000001.torchrl").write_text("damaged")
     assert checkpoint_steps(best_checkpoint(store.best)) == 1
+    # it may be the best, so it is not removed in favour of others either
+    assert store.save_best(7, 10.0)
+    store.save(8)
+    assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [1, 2, 7]
     assert best_checkpoint(tmp_path / "none") is None
 
 

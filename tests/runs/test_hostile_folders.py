@@ -1,9 +1,11 @@
 """Folders of runs that somebody else has made: links must not lead what is written out of them."""
 
 import pytest
+import yaml
 
 from safe_rl.cli.report import ReportOptions, report
 from safe_rl.collectors import Recording
+from safe_rl.evaluation.loading import robot_of
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.loggers import TensorboardLogger
@@ -54,10 +56,39 @@ def test_a_linked_recording_is_not_begun_anew(tmp_path):
     assert listing(mine) == ["00000003.pt"]
 
 
-def test_events_stay_in_the_folder_of_the_run(tmp_path):
+@pytest.mark.parametrize("name", ["../elsewhere", "..", "../", "a/b"])
+def test_events_stay_in_the_folder_of_the_run(name, tmp_path):
     with pytest.raises(ValueError, match="it names a folder in that of the run"):
-        TensorboardLogger(exp_name="../elsewhere", log_dir=str(tmp_path / "run"))
-    assert not (tmp_path / "elsewhere").exists()
+        TensorboardLogger(exp_name=name, log_dir=str(tmp_path / "run"))
+    assert listing(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"env": {"name": ".."}}, "env"),
+        ({"algo": {"name": "../mine"}}, "algo"),
+        ({"algo": 3}, "algo"),
+        ({"import": 5}, "import"),
+        ({"seed": "x"}, "seed"),
+        ({"cost_limits": [25]}, "cost_limits"),
+        ({"transforms": "saute"}, "transforms"),
+    ],
+)
+def test_a_configuration_that_no_run_writes_is_refused_in_one_line(changes, key, tmp_path):
+    settings = {"env": {"name": "a"}, "algo": {"name": "b"}, "seed": 0, "cost_limits": {}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    assert Run(tmp_path).seed == 0
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings | changes))
+    with pytest.raises(ValueError, match=f"it lacks a usable {key}\\.$"):
+        Run(tmp_path).config  # noqa: B018
+
+
+@pytest.mark.parametrize("content", ["[1]", "{}", '"x"'])
+def test_a_note_about_a_robot_that_no_run_writes_is_refused(content, tmp_path):
+    (tmp_path / "robot.json").write_text(content)
+    with pytest.raises(ValueError, match="is not as a run writes it"):
+        robot_of(Run(tmp_path), {"robot_base": "mine.xml"})
 
 
 def test_a_linked_report_is_not_written(tmp_path):

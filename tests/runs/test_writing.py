@@ -128,8 +128,8 @@ def test_tensorboard_compares_runs_by_what_was_set(tmp_path):
     assert {info.name for info in page.hparam_infos} == {*given[0], *given[1]}
 
 
-def test_a_measure_of_ones_own_is_what_is_held_against_the_limit(tmp_path, capsys):
-    config = compose_config("env=PointMass", "logger=none")
+def test_a_risk_measure_is_what_is_held_against_the_limit(tmp_path, capsys):
+    config = compose_config("env=PointMass", "logger=none", "risk=cvar")
     writer = RunWriter(Run(tmp_path), config, {"cost": 25.0}, 1000)
     with writer.writing():
         writer.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
@@ -177,3 +177,16 @@ def test_writing_ends_cleanly_when_training_fails(tmp_path):
     with pytest.raises(FloatingPointError):
         fail()
     assert len(writer.run.table_file.read_text().splitlines()) == 2
+
+
+def test_an_estimate_of_the_mean_is_no_other_measure(tmp_path, capsys):
+    """limits=paper estimates the mean from batches shorter than episodes."""
+    config = compose_config("env=PointMass", "logger=none", "limits=paper")
+    writer = RunWriter(Run(tmp_path), config, {"cost": 25.0}, 1000)
+    with writer.writing():
+        writer.add(row(1, 1.0, 20.0) | {"violation_cost": 62.0})
+    assert "cost 20.0 (limit 25)" in writer.summary()
+    assert "cost=20.0/25" in capsys.readouterr().err
+    run = Run(tmp_path)
+    assert (run.measure, run.excess("cost")) == ("mean", -5.0)
+    assert not run.limits_another_measure("cost")

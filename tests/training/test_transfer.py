@@ -10,7 +10,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.models import QEnsemble, make_bounded_actor
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.training.building import begin_from
+from safe_rl.training.building import begin_from, estimated
 
 pytestmark = pytest.mark.long
 
@@ -77,6 +77,7 @@ def test_the_cost_critic_stays_new_with_another_risk_measure(trained):
     risk, source = {"_target_": "safe_rl.objectives.CVaR"}, trained.writer.directory
     fresh = make_fresh(trained).algorithm
     assert begin_from(fresh, {"init_from": source, "risk": risk}) == ["actor", "critic"]
+    assert estimated({"risk": risk | {"tail": 0.1}}) != estimated({"risk": risk | {"tail": 0.5}})
 
 
 @pytest.mark.parametrize(
