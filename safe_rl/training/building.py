@@ -173,7 +173,8 @@ def _cost_critics(checkpoint: Path) -> tuple[list[str], tuple[Any, Any]]:
 
 def estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
     """What decides which measure cost critics estimate: the risk, and the loss of Q functions."""
-    loss = (config.get("loss") or {}).get("_target_") if config.get("critics") else None
+    has_q_functions = isinstance(config.get("critics"), Mapping)
+    loss = (config.get("loss") or {}).get("_target_") if has_q_functions else None
     risk = config.get("risk") or {}
     # with risk=mean the section may still have numbers
     read = ("_target_", "tail", "most_over") if risk.get("_target_") else ()
