@@ -103,7 +103,7 @@ class Constraints(Resumable):
         if risk is not None and tracker is None:
             raise ValueError(
                 "risk: only the mean cost is limited by the episodes of a batch alone "
-                "(limits=paper); other measures need limits=default."
+                "(limits=null); other measures need limits, as in conf/algo/cpo.yaml."
             )
         return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
 

@@ -224,8 +224,10 @@ OWN_UPDATE = """
 algo: {name: mine, constrained: true}
 loss: {_target_: safe_rl.objectives.PPOLoss, clip_epsilon: 0.2, entropy_coeff: 0.0}
 policy_update: {_target_: test_training.ReportingUpdate}
-advantage: {_target_: safe_rl.objectives.VectorGAE, gamma: 0.99, lmbda: 0.95}
-cost_advantage: {_target_: safe_rl.objectives.CostGAE, gamma: 0.99, lmbda: 0.9}
+advantage:
+  {_target_: safe_rl.objectives.VectorGAE, gamma: 0.99, lmbda: 0.95, value_target: return_to_go}
+cost_advantage:
+  {_target_: safe_rl.objectives.CostGAE, gamma: 0.99, lmbda: 0.9, value_target: return_to_go}
 critic_update:
   _target_: safe_rl.algorithms.MinibatchUpdate
   optimizer: {_target_: torch.optim.Adam, _partial_: true, lr: 1.0e-3}
