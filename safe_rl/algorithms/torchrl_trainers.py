@@ -5,12 +5,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.trainers import OptimizationStepper, TrainerHookBase
 
-from safe_rl.algorithms.algorithm_contract import PolicyUpdate
+from safe_rl.algorithms.algorithm_contract import PolicyUpdate, Stateful
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.minibatch import MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting
@@ -18,7 +21,7 @@ from safe_rl.objectives import LimitState, Multiplier, SurrogateLoss
 from safe_rl.resumable import Resumable
 
 
-class ConstraintHook(Resumable, TrainerHookBase):
+class ConstraintHook(TrainerHookBase):
     """Updates constraints and multiplier with every collected batch, and tells a loss.
 
     A trainer calls it before the losses (`register`), and logs its returns, costs, violations and
@@ -79,12 +82,21 @@ class ConstraintHook(Resumable, TrainerHookBase):
         """Values to log about the last batch."""
         return self._row
 
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """What a checkpoint has of it."""
-        return (
-            "accounting", "constraints", *(["multiplier"] if self.multiplier is not None else [])
-        )  # fmt: skip
+    def state_dict(self) -> dict[str, Any]:
+        """Accounting, constraints and multiplier."""
+        return {name: part.state_dict() for name, part in self._components().items()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        for name, part in self._components().items():
+            part.load_state_dict(state_dict[name])
+
+    def _components(self) -> dict[str, Stateful]:
+        parts: dict[str, Stateful] = {
+            "accounting": self.accounting,
+            "constraints": self.constraints,
+        }
+        return parts if self.multiplier is None else {**parts, "multiplier": self.multiplier}
 
     def register(self, trainer: Trainer, name: str = "constraints") -> None:
         """Add the hook to a trainer, for every batch, its log and its checkpoints."""

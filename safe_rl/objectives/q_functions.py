@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -53,7 +53,7 @@ class ReplayLoss(Checked, SharesTensors):
         risk_measure: Class of risk measure that the cost critics estimate; None for means only.
     """
 
-    risk_measure: ClassVar[type | None] = None
+    risk_measure: type | None = None
 
     @property
     def priority_key(self) -> NestedKey | None:
