@@ -13,4 +13,4 @@ def test_a_page_has_its_parts_in_order(algo):
     assert places == sorted(places)
     assert places[0] > 0
     assert made(page, "conf") == f"algo/{algo}.yaml"
-    assert algo == "bc" or made(page, "measured") == algo
+    assert made(page, "measured") == algo or "o results yet" in page
