@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import (
     ConfigCompositionException,
@@ -45,14 +46,18 @@ def compose_run(
         name: Name of the primary configuration.
 
     Raises:
-        ValueError: If Hydra refuses a word or a file; the message is one line.
+        ValueError: If a folder does not exist, or Hydra refuses a word or a file; the message is
+            one line.
 
     Examples:
         >>> compose_run(["env=CarGoal1", "seed=3"]).seed
         3
     """
     store_configs()
-    paths = [f"file://{Path(folder).expanduser().absolute()}" for folder in folders]
+    places = [Path(folder).expanduser().absolute() for folder in folders]
+    for missing in (place for place in places if not place.is_dir()):
+        raise ValueError(f"config_dir={missing}: there is no such folder.")
+    paths = [f"file://{place}" for place in places]
     words = [*overrides_of({"hydra.searchpath": paths} if paths else {}), *words]
     try:
         config = _compose(words, name)
@@ -63,8 +68,14 @@ def compose_run(
 
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
-    with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
-        return compose(name, list(words), return_hydra_config=True)
+    # an application of the user's may be on Hydra too, and call `safe_rl.train`
+    outside = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
+            return compose(name, list(words), return_hydra_config=True)
+    finally:
+        GlobalHydra.instance().hydra = outside
 
 
 def name_choices(config: DictConfig, choices: Mapping[str, str]) -> None:

@@ -91,7 +91,8 @@ def refuse_changes(directory: Path, config: DictConfig) -> None:
         ValueError: If there is such a key; the message names it.
     """
     before = flatten(read_config(Run(directory).config_file))
-    now = flatten(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
+    settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    now = flatten(OmegaConf.to_container(settings, resolve=True))  # type: ignore[arg-type]
     for key in sorted({*before, *now}):
         if before.get(key) != now.get(key) and not role_of(key).may_change:
             raise ValueError(

@@ -2,8 +2,11 @@
 
 import pytest
 import torch
+from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
+from run_configs import off_policy_config
 
+from safe_rl.algorithms import OffPolicy
 from safe_rl.models import make_actor, make_critic
 from safe_rl.trust import TargetError, allow
 
@@ -51,7 +54,8 @@ def test_a_missing_network_is_named(tmp_path):
         point_mass_trainer(tmp_path, "algo=cpo", f"{TARGET}.without_costs", minibatch_size=None)
 
 
-def test_an_off_policy_algorithm_refuses_it(tmp_path):
+def test_an_off_policy_algorithm_refuses_it():
     allow(__name__)
+    config = off_policy_config("algo=sac", f"{TARGET}.tall")
     with pytest.raises(ValueError, match=r"model\._target_ is for on-policy algorithms"):
-        point_mass_trainer(tmp_path, "algo=sac", f"{TARGET}.tall", minibatch_size=None)
+        OffPolicy.from_config(config, PointMass(4))

@@ -128,7 +128,7 @@ def test_rates_are_those_of_the_longest_beginning_and_wrong_ones_are_told_the_ne
 
 
 def test_constructors_are_checked_unless_an_annotation_cannot_be_read():
-    with pytest.raises(ValueError, match=r"tau=0.7: it must be a number above 0 and at most 0\.5"):
+    with pytest.raises(ValueError, match=r"tau=0.7: it must be less than or equal to 0\.5"):
         make_update(0, tau=0.7)
 
     class Own(PolicyUpdate):

@@ -130,7 +130,6 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
         ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
         ({"callbacks": 3}, "callbacks must be a list of functions"),
-        ({"logger": None}, "logger=none"),
         ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],
 )

@@ -5,11 +5,11 @@ import struct
 
 import pytest
 import yaml
-from commands import SMALL
+from commands import SMALL, status_of
 from run_configs import without_times
 
 import safe_rl
-from safe_rl.cli import evaluate, export, train
+from safe_rl.cli import evaluate, export
 
 ROBOT = """
 <mujoco>
@@ -59,7 +59,7 @@ def run(tmp_path, monkeypatch):
         write_robot(tmp_path, **robot)
         folder = tmp_path / name
         robot = ("env.robot_base=robot/ball.xml", "env.sensors_obs=[gyro]")
-        assert train.main([*SMALL, *robot, f"hydra.run.dir={folder}", f"frames={frames}"]) == 0
+        assert status_of(*SMALL, *robot, f"hydra.run.dir={folder}", f"frames={frames}") == 0
         return folder
 
     return begin
@@ -73,7 +73,7 @@ def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation_nor_its_poli
         rows.append((place / "evaluation.csv").read_text())
         write_robot(tmp_path, density=30)
     assert rows[0] == rows[1] == rows[2]
-    assert train.main([f"resume={folder}", "frames=80"]) == 0
+    assert status_of(f"resume={folder}", "frames=80") == 0
     assert without_times(folder / "progress.csv") == without_times(whole / "progress.csv")
     # the name of the robot, by which runs are told apart, stays
     config = yaml.safe_load((folder / "config.yaml").read_text())
@@ -90,7 +90,7 @@ def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
     (elsewhere := tmp_path / "elsewhere").mkdir()
     run().rename(elsewhere / "run")
     monkeypatch.chdir(elsewhere)
-    assert train.main(["resume=run", "frames=80"]) == 0
+    assert status_of("resume=run", "frames=80") == 0
     assert safe_rl.load("run").env.rollout(3).shape == (1, 3)
     assert evaluate.main(["run", "episodes=2", "num_threads=1", "env.robot_base=point"]) == 1
     assert "trained on other observations or actions" in capsys.readouterr().err
@@ -106,7 +106,7 @@ def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
         (folder / "robot.json").write_text(json.dumps(note | {"file": kept}))
         assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 1
         assert "has changed since the run began" in capsys.readouterr().err
-    assert "has changed since the run began" in train.main([f"resume={folder}", "frames=80"])
+    assert "has changed since the run began" in status_of(f"resume={folder}", "frames=80")
 
 
 @pytest.mark.parametrize("place", ["../meshes", "{}/meshes", "linked"])

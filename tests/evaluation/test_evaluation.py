@@ -92,7 +92,9 @@ def test_an_environment_of_another_kind_has_no_published_scores(run, monkeypatch
     """What fulfils the contract of environments and calls itself PointGoal1."""
     change_config(run, env={"_target_": "mine.build", "name": "PointGoal1", "cost_keys": ["cost"]})
     make = functools.partial(make_env, "PointGoal1")
-    monkeypatch.setattr("safe_rl.envs.make_env", lambda node, **kwargs: make(**kwargs))
+    monkeypatch.setattr(
+        "safe_rl.evaluation.loading.make_env", lambda node, **kwargs: make(**kwargs)
+    )
     found = evaluate(run, options(episodes=2)).estimates
     assert found["episode_length"].value == 1000
     assert "normalised_return" not in found
@@ -131,7 +133,7 @@ def test_environments_are_closed_whatever_happens(run, monkeypatch):
         made.append(make_env(node, **kwargs))
         return made[-1]
 
-    monkeypatch.setattr("safe_rl.envs.make_env", make)
+    monkeypatch.setattr("safe_rl.evaluation.loading.make_env", make)
     evaluate(run, options(episodes=1))
     monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
     with pytest.raises(TypeError):
