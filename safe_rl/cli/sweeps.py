@@ -15,6 +15,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from hydra.core.utils import JobReturn
+from hydra.conf import HydraConf
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict
@@ -31,7 +33,7 @@ _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 
 
-def run_in_sweep(config: DictConfig, settings: DictConfig, directory: Path) -> float:
+def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> float:
     """Begin or continue the run of one job; a failure is written into its folder.
 
     Args:
@@ -97,7 +99,7 @@ class Summary(Callback):
                 end_with_parent(_GRACE)
             self._note(config, "interrupted")
 
-    def on_job_end(self, config: DictConfig, **_: Any) -> None:
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
         """Note how a job has ended."""
         if config.hydra.mode == RunMode.MULTIRUN:
             failure = Run(Path(config.hydra.runtime.output_dir)).failure_file

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.conf import HydraConf
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -131,7 +132,7 @@ def job(config: DictConfig) -> float | None:
     return None
 
 
-def _check(config: DictConfig, settings: DictConfig, directory: Path) -> None:
+def _check(config: DictConfig, settings: HydraConf, directory: Path) -> None:
     if settings.job.config_name == RESUMED:
         refuse_changes(directory, config)
     else:

@@ -82,7 +82,7 @@ def test_the_report_has_the_command_of_a_run_from_python(tmp_path):
     for root in ("runs", "kept"):
         (found,), skipped = find_runs(tmp_path / root)
         assert not skipped
-        begin, *words = found.command.split(" env=PointGoal1 algo=cpo ")
+        begin, *words = found.repeating.split(" env=PointGoal1 algo=cpo ")
         assert begin.startswith("python train.py --config-dir=")
         assert begin.endswith("mine")
         assert "'cost_limits={cost:10}' num_envs=2" in words[0]

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from commands import ROOT, SMALL, composed, in_a_process
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
@@ -52,7 +53,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         summary.on_job_start(config)
         made = OmegaConf.create({"env": {"name": "mine"}, "algo": {}})
         run_in_sweep(made, config.hydra, directory)
-        summary.on_job_end(config)
+        summary.on_job_end(config, JobReturn())
 
     monkeypatch.setattr("safe_rl.training.train.run_job", run_job)
     monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
