@@ -1,5 +1,6 @@
 """Any valid configuration makes a working environment; errors name the key that is wrong."""
 
+import ast
 import math
 
 import pytest
@@ -16,7 +17,16 @@ often = settings(
 
 COUNTED = ("walls", "hazards", "vases", "pillars", "buttons", "gremlins")
 PLACED = (*COUNTED, "robot", "goal", "box")
-FIELDS = dict(Keys.__annotations__)
+
+
+def kind_of(annotation: str) -> str:
+    """The type in an annotation, as it is written: that of ``Annotated[bool, "…"]`` is "bool"."""
+    node = ast.parse(annotation, mode="eval").body
+    is_annotated = isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Annotated"
+    return ast.unparse(node.slice.elts[0]) if is_annotated else annotation
+
+
+FIELDS = {name: kind_of(annotation) for name, annotation in Keys.__annotations__.items()}
 # vision needs OpenGL, and has its own tests
 FLAGS = [name for name, kind in FIELDS.items() if kind == "bool" and name != "observe_vision"]
 

@@ -114,7 +114,7 @@ class VelocityConfig:
     """
 
     robot: Annotated[str, "the robot"] = ""
-    velocity_threshold: Annotated[NotNegative, "speed above which a step costs 1 [m/s]"] = None
+    velocity_threshold: Annotated[NotNegative, "speed above which a step costs 1 [m/s]"] = _OF_ROBOT
     num_steps: Annotated[Count, "steps after which an episode is truncated"] = 1000
     frame_skip: Annotated[Count, "substeps per step"] = _OF_ROBOT
     # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
