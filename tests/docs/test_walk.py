@@ -27,7 +27,8 @@ FILE = re.compile(r"^<!-- file: (\S+) -->\n```\w*\n(.*?)^```", re.M | re.S)
 @pytest.fixture
 def place(tmp_path):
     """Where the reader is: a folder with the files of the pages, as if in a checkout."""
-    (tmp_path / "train.py").symlink_to(ROOT / "train.py")
+    for name in ("train.py", "conf"):
+        (tmp_path / name).symlink_to(ROOT / name)
     for page in WALK:
         for name, text in FILE.findall((DOCS / page).read_text()):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +74,8 @@ def test_every_page_leads_to_the_next():
 def test_from_the_first_page_to_a_certified_policy(place):
     assert command("index.md", "env=PointGoal1")[:3] == command("start.md", "env=PointGoal1")[:3]
     said = carry_out(command("start.md", "train.py", "runs/first"), place)
-    assert "Certified at 95% with sampled actions: mean_cost ≤" in said
+    assert "with sampled actions" in said
+    assert "mean_cost ≤" in said
     assert json.loads((place / "runs/first/certificate.json").read_text())["certified"]
     look = command("start.md", "safe-rl evaluate", "checkpoint=certified")
     quick = [re.sub("episodes=100", "episodes=3", word) for word in look if word != "video=true"]

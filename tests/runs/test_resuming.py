@@ -17,6 +17,7 @@ from run_configs import compose_config, point_mass_config, without_times
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.cli.config import check_settings
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError
@@ -196,8 +197,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     point_mass_trainer(tmp_path / "run", paper, "frames=640", "checkpoint.interval=0").run()
     older, newest = sorted((tmp_path / "run/checkpoints/last").iterdir())
     newest.write_bytes(newest.read_bytes()[:-100])
-    assert is_finished(tmp_path / "run", 480)
-    assert not is_finished(tmp_path / "run", 640)
+    assert is_finished(Run(tmp_path / "run"), 480)
+    assert not is_finished(Run(tmp_path / "run"), 640)
     trainer = point_mass_trainer(tmp_path / "run", paper)
     with pytest.warns(UserWarning, match=f"{newest.name}.*older {older.name}"):
         trainer.resume()
@@ -236,8 +237,10 @@ def test_tensorboard_forgets_what_is_done_again(tmp_path):
 
 
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
-    check_same_run(tmp_path, point_mass_config())
+    check_same_run(Run(tmp_path), point_mass_config())
     point_mass_trainer(tmp_path).run()
-    check_same_run(tmp_path, point_mass_config("frames=9000", "num_threads=2"))
+    longer, other = point_mass_config("frames=9000", "num_threads=2"), point_mass_config("seed=1")
+    check_settings(longer)  # as jobs do, which leaves out what a run does not have
+    check_same_run(Run(tmp_path), longer)
     with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):
-        check_same_run(tmp_path, point_mass_config("seed=1"))
+        check_same_run(Run(tmp_path), other)
