@@ -197,8 +197,8 @@ def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     point_mass_trainer(tmp_path / "run", paper, "frames=640", "checkpoint.interval=0").run()
     older, newest = sorted((tmp_path / "run/checkpoints/last").iterdir())
     newest.write_bytes(newest.read_bytes()[:-100])
-    assert is_finished(Run(tmp_path / "run"), 480)
-    assert not is_finished(Run(tmp_path / "run"), 640)
+    assert is_finished(Run(tmp_path / "run").checkpoints("last"), 480)
+    assert not is_finished(Run(tmp_path / "run").checkpoints("last"), 640)
     trainer = point_mass_trainer(tmp_path / "run", paper)
     with pytest.warns(UserWarning, match=f"{newest.name}.*older {older.name}"):
         trainer.resume()

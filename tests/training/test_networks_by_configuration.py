@@ -74,7 +74,7 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
         trainer.close()
 
 
-@pytest.mark.parametrize("choice", ["model.normalise=10", "model=dict", "model=gru"])
+@pytest.mark.parametrize("choice", ["+model.normalise=10", "model=dict", "model=gru"])
 def test_off_policy_algorithms_take_perceptrons_alone(choice):
     config = compose_config("algo=sac", "env=PointGoal1", choice)
     with pytest.raises(ValueError, match=r"algo=sac.*model\.\w+ is for on-policy algorithms"):
