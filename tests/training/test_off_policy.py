@@ -196,7 +196,7 @@ def test_a_loss_of_ones_own_is_passed_the_limits_and_their_state(make_trainer):
     trainer = make_trainer("run", "algo=sac_lagrangian", own, "frames=320")
     trainer.run()
     loss = trainer.algorithm.policy_update.loss
-    assert loss.target >= 25.0
+    assert 0 < loss.target <= 25.0
     assert loss.limits == {"cost": 25.0}
 
 
@@ -251,7 +251,7 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
     [
         (["algo=sac", "memory.capacity=100"], "must hold exploration.random_steps=160"),
         (["algo=sac_lagrangian", "risk=cvar"], "limits mean costs only.*whole episodes"),
-        (["algo=sac_lagrangian", "cost_limits={}"], "Without constraints use algo=sac"),
+        (["algo=sac_lagrangian", "cost_limits={}"], "Without constraints use algo=ppo or algo=sac"),
     ],
 )
 def test_what_could_not_learn_is_refused(overrides, message):

@@ -82,6 +82,7 @@ def make_trainer(tmp_path):
     (tmp_path / "algo").mkdir()
     (tmp_path / "algo" / "one_step_q.yaml").write_text(
         "# @package _global_\nalgo: {name: one_step_q, _target_: test_off_policy_seam.OneStepQ}\n"
+        "model: {hidden_sizes: [8]}\ncritic_update: {minibatch_size: 1, num_passes: 1}\n"
     )
 
     def make(name, *overrides):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from commands import status_of
 from point_mass import Forgetful, PointMass
-from run_configs import assert_resumes_exactly, point_mass_config
+from run_configs import assert_resumes_exactly, off_policy_config, point_mass_config
 from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
@@ -25,7 +25,10 @@ SAUTE = ["algo=ppo", "transforms=[saute]", "cost_limits={cost: 0.5}"]
 
 
 def make_trainer(directory, *overrides, minibatch_size=40):
-    config = point_mass_config(*overrides, minibatch_size=minibatch_size)
+    if minibatch_size is None:  # of an algorithm with a replay buffer
+        config = off_policy_config(*overrides)
+    else:
+        config = point_mass_config(*overrides, minibatch_size=minibatch_size)
     seed_everything(config.seed, None)
     env = transform_env(
         PointMass(config.num_envs, seed=config.seed), transforms_of(config), evaluating=False
