@@ -5,6 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
+from safe_rl.envs import store_configs
 from safe_rl.envs.extending import (
     BOX,
     CYLINDER,
@@ -40,6 +41,7 @@ def undone() -> Iterator[None]:
             table.clear()
             table.update(rows)
         set_registered_keys(keys)
+        store_configs()  # the keys that Hydra knows
         forget_scenes()
 
 

@@ -195,10 +195,12 @@ def test_what_is_wrong_on_the_device_is_said_by_a_later_call(two):
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-@pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
-def test_training_and_a_certificate_with_the_preset_for_gpus(algo, device, tmp_path):
+@pytest.mark.parametrize(
+    ("algo", "choice"), [("ppo_lagrangian", "preset=gpu"), ("sac_lagrangian", "env.physics=warp")]
+)
+def test_training_and_a_certificate_on_warp(algo, choice, device, tmp_path):
     run_train(
-        *("env=PointGoal1", f"algo={algo}", "preset=gpu", f"device={device}", "num_envs=4"),
+        *("env=PointGoal1", f"algo={algo}", choice, f"device={device}", "num_envs=4"),
         *("env.num_steps=10", "frames=64", "frames_per_batch=32", "certificate.ranking=2"),
         *("certificate.episodes=4", "logger=none", "num_threads=1", f"hydra.run.dir={tmp_path}"),
     )
@@ -275,5 +277,5 @@ def test_what_warp_lacks_is_refused(tmp_path):
         SafetyGymEnv(BUSY | {"robot_base": str(robot), "physics": "warp"})
     with pytest.raises(ConfigError, match="'physics' warp runs on the devices cpu and cuda"):
         SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")
-    with pytest.raises(ConfigError, match="'physics' must be one of"):
+    with pytest.raises(ConfigError, match="physics=jax: it must be 'cpu' or 'warp'"):
         SafetyGymEnv({"physics": "jax"})
