@@ -74,9 +74,16 @@ def test_workers_have_noise_of_their_own_whatever_seeding_does():
     assert drawn[0] != drawn[1]
 
 
-@pytest.mark.parametrize(("num_collectors", "frames"), [(4, 60), (2, 63), (0, 60)])
-def test_numbers_that_cannot_be_shared(num_collectors, frames):
-    with pytest.raises(ValueError, match="num_envs must be a multiple"):
+@pytest.mark.parametrize(
+    ("num_collectors", "frames", "why"),
+    [
+        (4, 60, "num_envs must be a multiple"),
+        (2, 63, "num_envs must be a multiple"),
+        (0, 60, "num_collectors=0"),
+    ],
+)
+def test_numbers_that_cannot_be_shared(num_collectors, frames, why):
+    with pytest.raises(ValueError, match=why):
         make_process_collector(
             MAKE(num_envs=6), MAKE, None,
             frames_per_batch=frames, num_collectors=num_collectors, device="cpu",
