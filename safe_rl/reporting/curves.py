@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -13,10 +15,19 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 
 from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.figures import LIMIT_STYLE, WIDTH, Style, add_legend, literal, set_grid
+from safe_rl.reporting.figures import (
+    LIMIT_STYLE,
+    WIDTH,
+    Style,
+    add_legend,
+    algorithm_styles,
+    literal,
+    set_grid,
+)
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.outcome import final_width
+from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import t_interval
 
 _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
@@ -100,6 +111,69 @@ def draw_learning_curves(
         axis.set_xlabel("environment steps")
     add_legend(figure, panels.ravel())
     return figure
+
+
+def comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -> list[Experiment]:
+    """The paper's algorithms on some environments: one experiment each, with equally many steps.
+
+    These are the steps that most of the experiments have. Of several experiments that differ in
+    other settings, the one with the most seeds is taken.
+    """
+    known = [
+        replace(e, runs=e.finished, settings={})
+        for e in experiments
+        if e.benchmark in environments
+        and e.base in ALGORITHMS
+        and e.has_published_limit
+        and e.finished
+        and not (e.is_continued or e.runs[0].settings.get("transforms"))
+    ]
+    cells = Counter(s for _, _, s in {(e.benchmark, e.base, e.planned_steps) for e in known})
+    steps = max(cells, key=lambda steps: (cells[steps], steps), default=0)
+    own = sorted((e for e in known if e.planned_steps == steps), key=lambda e: len(e.runs))
+    return [*{(e.benchmark, e.base): e for e in own}.values()]
+
+
+def draw_benchmark(
+    experiments: Sequence[Experiment], environments: Sequence[str], width: float = WIDTH
+) -> Figure:
+    """Draw return, episode cost and cost rate below one another, a column per environment.
+
+    With the experiments of `comparable` on a robot's environments, this is the paper's Figure 7, 8
+    or 9. Below the name of an environment stands how many of the algorithms there are.
+    """
+    figure = Figure(figsize=(width, 0.55 * width), layout="constrained")
+    panels = figure.subplots(3, len(environments), sharex=True)
+    styles = algorithm_styles(experiments)
+    for axes, name in zip(panels.T, environments, strict=True):
+        shown = sorted(
+            (e for e in experiments if e.benchmark == name),
+            key=lambda e: [*ALGORITHMS].index(e.base),
+        )
+        for experiment in shown:
+            draw_experiment(experiment, "cost", axes, styles[experiment.label])
+        for panel, height in limits_of(shown, "cost"):
+            axes[panel].axhline(height, **LIMIT_STYLE)
+        axes[0].set_title(f"{name}\n{_coverage(shown)}", fontsize=8)
+        axes[2].set_xlabel("environment steps", fontsize=8)
+        set_axes(axes, ticks=3)
+        if not shown:
+            for axis in axes:
+                axis.text(0.5, 0.5, "no runs", transform=axis.transAxes, ha="center", color="0.5")
+                axis.set_yticks([])
+    for axis, title in zip(panels[:, 0], _TITLES, strict=True):
+        axis.set_ylabel(title, fontweight="bold")
+    add_legend(figure, panels.ravel())
+    return figure
+
+
+def _coverage(experiments: Sequence[Experiment]) -> str:
+    """How many of the paper's algorithms there are, and their numbers of seeds."""
+    seeds = sorted({len(e.runs) for e in experiments})
+    several = " to ".join(f"{n}" for n in dict.fromkeys((*seeds[:1], *seeds[-1:])))
+    unit = "seed" if seeds == [1] else "seeds"
+    algorithms = f"{len(experiments)} of {len(ALGORITHMS)} algorithms"
+    return algorithms + (f", {several} {unit}" if seeds else "")
 
 
 def draw_small_multiples(

@@ -21,7 +21,9 @@ from safe_rl.files import replace_text
 from safe_rl.reporting import figures, scoring, slates
 from safe_rl.reporting.archive import Run, find_runs
 from safe_rl.reporting.curves import (
+    comparable,
     curve_rows,
+    draw_benchmark,
     draw_learning_curves,
     draw_small_multiples,
     drawn_keys,
@@ -29,10 +31,11 @@ from safe_rl.reporting.curves import (
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.tables import Table, clean, short_number
 from safe_rl.runs.curves import save_figure
-from safe_rl.scores.benchmark import Suite
+from safe_rl.scores.benchmark import SLATES, Suite
 
 _MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed page
 _MOST_CURVES = 6  # in one panel
+_FEWEST_ENVIRONMENTS = 3  # of the benchmark, with which its figures are drawn
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
 
@@ -142,7 +145,14 @@ def build_report(
     parts: list[tuple[str, str, Sequence[Block]]] = [
         ("final", "Final scores", finals),
         ("learning", "What learning cost", list(filter(None, map(scoring.learning_table, groups)))),
-        ("curves", "Learning curves", _curves(experiments, styles, look.width)),
+        (
+            "curves",
+            "Learning curves",
+            [
+                *benchmark_figures(experiments, look.width),
+                *_curves(experiments, styles, look.width),
+            ],
+        ),
         ("fronts", "Return against cost", _fronts(groups, finals, styles, look.width)),
         (
             "normalised",
@@ -185,6 +195,29 @@ def _fronts(
     texts = [f"{what}: {', '.join(e.algorithm for e, _ in own)}" for what, own in panels.items()]
     says = f"Final return against final episode cost. {'; '.join(texts)}"
     return [Drawing("fronts", "", figures.draw_fronts(panels, styles, width), says)]
+
+
+def benchmark_figures(experiments: Sequence[Experiment], width: float) -> list[Drawing]:
+    """The paper's Figures 7 to 9, of robots with runs; none if there are runs on few environments.
+
+    Environments without runs are shown as missing.
+    """
+    robots = {"Point": 7, "Car": 8, "Doggo": 9}
+    found = {robot: comparable(experiments, SLATES[f"SG{robot}"]) for robot in robots}
+    if len({e.benchmark for own in found.values() for e in own}) < _FEWEST_ENVIRONMENTS:
+        return []
+    return [
+        Drawing(
+            f"figure_{robots[robot]}",
+            f"The paper's Figure {robots[robot]}, from runs of "
+            f"{short_number(own[0].planned_steps)} steps",
+            draw_benchmark(own, SLATES[f"SG{robot}"], width),
+            "Return, episode cost and cost rate of the paper's algorithms, a column for each of "
+            f"{robot}'s environments",
+        )
+        for robot, own in found.items()
+        if own
+    ]
 
 
 def _curves(experiments: Sequence[Experiment], styles: Styles, width: float) -> list[Drawing]:

@@ -10,6 +10,7 @@ from safe_rl.files import CONF
 from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
 from safe_rl.reporting.experiments import PACKAGED
 from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts
+from safe_rl.reporting.page import benchmark_figures
 from safe_rl.reporting.scoring import final_table
 from safe_rl.runs.curves import save_figure
 
@@ -42,6 +43,27 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["PPO", "TRPO (per 1,000 steps)", "CPO (unfinished)"]
     assert panels[1, 0].get_xlim() == panels[1, 2].get_xlim()
+
+
+def test_the_figures_of_the_paper_show_what_is_missing(tmp_path):
+    for env in ("PointGoal1", "PointGoal2", "PointButton1"):
+        for seed in (0, 10):
+            write_run(tmp_path, env, "cpo", seed, **ROWS, costs=[20.0] * 3, frames=3000)
+    # other lengths, variants with fewer seeds, and other algorithms are left out
+    write_run(tmp_path, "PointGoal1", "cpo", 0, **ROWS, costs=[90.0] * 3, frames=2000, folder="a")
+    write_run(tmp_path, "PointGoal1", "cpo", 0, **ROWS, costs=[90.0] * 3, frames=3000, folder="b",
+              model={"width": 9})  # fmt: skip
+    write_run(tmp_path, "PointGoal2", "focops", **ROWS, costs=[90.0] * 3, frames=3000)
+    (drawing,) = benchmark_figures(experiments_in(tmp_path), 12.0)
+    assert drawing.name == "figure_7"
+    panels = np.array(drawing.figure.axes).reshape(3, 6)
+    assert panels[0, 0].get_title() == "PointGoal1\n1 of 5 algorithms, 2 seeds"
+    assert panels[0, 3].get_title() == "PointButton2\n0 of 5 algorithms"
+    assert [text.get_text() for axes in panels[:, 3] for text in axes.texts] == ["no runs"] * 3
+    costs = [[*line.get_ydata()] for axes in panels[1, :2] for line in axes.lines]
+    assert costs == [[20.0] * 3, [25.0, 25.0]] * 2
+    some = [e for e in experiments_in(tmp_path) if e.benchmark != "PointButton1"]
+    assert benchmark_figures(some, 12.0) == []
 
 
 def test_every_limited_cost_has_a_row(tmp_path):
