@@ -216,16 +216,20 @@ def _check_entries(
 ) -> None:
     """Refuse transitions of another environment, or without an entry that the loss reads."""
     if missing := [_name(key) for key in buffer.in_keys if key not in steps.keys(True)]:
-        raise ValueError(f"it has no {', '.join(missing)}, which is learned from.")
-    sizes = {
-        "observation": env.observation_spec["observation"].shape[-1],
-        "action": actions.shape[-1],
-    }
-    for key, size in sizes.items():
-        if steps[key].shape[-1] != size:
+        why = "which is learned from."
+        if "privileged" in missing:
+            why = "which critics read: record it, or set model.critic_observes=[observation]."
+        raise ValueError(f"it has no {', '.join(dict.fromkeys(missing))}, {why}")
+    spec = env.observation_spec
+    sizes = {"observations": spec["observation"].shape[-1], "actions": actions.shape[-1]}
+    if "privileged" in buffer.in_keys:
+        sizes["privileged"] = spec["privileged"].shape[-1]
+    for name, size in sizes.items():
+        number = steps[name.removesuffix("s")].shape[-1]
+        if number != size:
             raise ValueError(
-                f"its {key}s are {steps[key].shape[-1]} numbers, those of this environment {size}. "
-                "It is a dataset of another one."
+                f"its {name} are {number} numbers, those of this environment {size}. It is a "
+                "dataset of another one."
             )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -19,9 +19,15 @@ from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import ExploringPolicy, QEnsemble, input_scale_vector
+from safe_rl.models import ExploringPolicy, QEnsemble
 from safe_rl.models.bounded_actors import bounded_actions
-from safe_rl.models.encoders import TO_FLATTEN, observed_entries
+from safe_rl.models.encoders import (
+    TO_FLATTEN,
+    Entry,
+    Observed,
+    critic_entries,
+    observed_entries,
+)
 from safe_rl.objectives import CostValues, MeanCosts, Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
@@ -85,7 +91,8 @@ class OffPolicy(Resumable, Algorithm):
         if multiplier is not None:
             multiplier.to(device)
         cost_values = instantiate(config.critics.get("cost_values"))
-        networks = build_networks(config, env, len(limits), device, cost_values)
+        read = config.model.get("critic_observes")
+        networks = build_networks(config, env, len(limits), device, cost_values, read)
         loss = instantiate(
             config.loss,
             {
@@ -257,6 +264,7 @@ def build_networks(
     num_costs: int,
     device: torch.device,
     cost_values: CostValues | None = None,
+    critic_observes: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
 
@@ -266,27 +274,27 @@ def build_networks(
         num_costs: Number of constrained costs; 0: no cost critics.
         device: Device of the parameters.
         cost_values: What the cost critics return; by default the mean.
+        critic_observes: Entries that critics read; by default the observation. In evaluation the
+            environment may not have them.
 
     Raises:
-        ValueError: If actions have no bounds, the observation is not a vector, or the model is for
-            on-policy algorithms only.
+        ValueError: If actions have no bounds, the observation is not a vector, the model is for
+            on-policy algorithms only, or the environment lacks an entry that critics read.
     """
     model, spec = config.model, bounded_actions(env)
     cost_values = MeanCosts() if cost_values is None else cost_values
-    size, actions = _observation_size(config, env), len(spec.low)
-    common: dict[str, Any] = {
-        "hidden_sizes": list(model.hidden_sizes),
-        "input_scale": input_scale_vector(model.input_scale, env.observation_layout, size),
-        "device": device,
-    }
+    _check_observation(config, env)
+    common: dict[str, Any] = {"hidden_sizes": list(model.hidden_sizes), "device": device}
+    actor = _inputs(critic_entries(None, env.observation_spec), config, env)
     bounds = {"low": spec.low, "high": spec.high}
-    networks = {"actor": instantiate(config.actor, observation_size=size, **bounds, **common)}
+    networks = {"actor": instantiate(config.actor, **actor, **bounds, **common)}
+    entries = critic_entries(critic_observes, env.observation_spec)
+    common |= _inputs(entries, config, env)
+    common |= {"action_size": len(spec.low), "in_keys": [*(e.key for e in entries), "action"]}
     if number := config.critics.rewards:
-        networks["critic"] = QEnsemble(size, actions, num_networks=number, **common)
+        networks["critic"] = QEnsemble(num_networks=number, **common)
     if num_costs and (number := config.critics.costs):
         networks["cost_critic"] = QEnsemble(
-            size,
-            actions,
             num_networks=number * cost_values.networks,
             num_outputs=num_costs * cost_values.outputs,
             out_key="cost_state_action_value",
@@ -295,8 +303,18 @@ def build_networks(
     return networks
 
 
-def _observation_size(config: DictConfig, env: EnvBase) -> int:
-    """Length of the observation, one vector; refuses other observations, and on-policy models."""
+def _inputs(entries: Sequence[Entry], config: DictConfig, env: EnvBase) -> dict[str, Any]:
+    """Number of the columns of all entries together, and their factors, for a constructor."""
+    layouts = {"observation": env.observation_layout, "privileged": env.privileged_layout}
+    observed = Observed(entries, layouts, config.model.input_scale, clip=None, encoders=None)
+    return {
+        "observation_size": sum(entry.shape[0] for entry in entries),
+        "input_scale": observed.scales(),
+    }
+
+
+def _check_observation(config: DictConfig, env: EnvBase) -> None:
+    """Refuse observations that are not one vector, and models for on-policy algorithms."""
     model = config.model
     if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
         raise ValueError(
@@ -310,4 +328,3 @@ def _observation_size(config: DictConfig, env: EnvBase) -> int:
             f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
             "with model=dict or model=cnn."
         )
-    return int(observed[0].shape[0])

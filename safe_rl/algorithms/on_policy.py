@@ -81,7 +81,7 @@ class OnPolicy(Algorithm):
         multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
         if multiplier is not None:
             multiplier.to(device)
-        networks = _build_networks(config, env, len(limits), device)
+        networks = _build_networks(config, env, len(limits), device, config.model)
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
         cost_advantage = None
         if limits:
@@ -112,7 +112,9 @@ class OnPolicy(Algorithm):
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build the policy, and the networks that it consists of."""
-        actor = _build_networks(config, env, 0, device)["actor"]
+        # the environment may not have what critics read
+        model = {**config.model, "critic_observes": None}
+        actor = _build_networks(config, env, 0, device, model)["actor"]
         return make_behaviour(actor), {"actor": actor}
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
@@ -199,7 +201,11 @@ def _policy_update(
 
 
 def _build_networks(
-    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device
+    config: DictConfig,
+    env: EnvBase,
+    num_costs: int,
+    device: torch.device,
+    model: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Networks of the node ``model``, by name; a ``_target_`` builds networks of the user's own."""
     given = {
@@ -210,7 +216,7 @@ def _build_networks(
         "device": device,
     }
     if (target := config.model.get("_target_")) is None:
-        return build_networks(config.model, **given)
+        return build_networks(model, **given, privileged_layout=env.privileged_layout)
     networks = instantiate(config.model, given)
     needed = ["actor", "critic", *(["cost_critic"] if num_costs else [])]
     missing = set(needed).difference(networks if isinstance(networks, dict) else ())

@@ -114,6 +114,7 @@ class Model:
     # logarithm of the initial standard deviation of actions
     initial_log_std: Annotated[float, Interval(ge=-20, le=10)]
     input_scale: dict[str, PositiveFloat]  # factors by component of the observation
+    critic_observes: list[Literal["observation", "privileged"]]  # entries that critics read
     # distribution of the actions
     head: Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
     # bound of normalised observations; null: they are not normalised

@@ -89,6 +89,7 @@ class Recording:
         cost_keys: Costs below ``next`` that are recorded.
         interface: Columns and units, ``interface`` of the environment. None: they are those of the
             environment in which the recording is used.
+        is_privileged: Whether the entry ``privileged`` is recorded, which critics may read.
 
     Raises:
         KeyError: When a batch is written that lacks one of the entries.
@@ -116,10 +117,13 @@ class Recording:
         folder: Path | str,
         cost_keys: Sequence[str],
         interface: Mapping[str, Any] | None = None,
+        *,
+        is_privileged: bool = False,
     ) -> None:
         self.folder, self._interface = Path(folder), interface
-        following = ("observation", "reward", *cost_keys, *_FLAGS)
-        self._keys = ["observation", "action", *(("next", key) for key in following)]
+        read = ("observation", "privileged") if is_privileged else ("observation",)
+        following = (*read, "reward", *cost_keys, *_FLAGS)
+        self._keys = [*read, "action", *(("next", key) for key in following)]
         self._cut: int | None = None  # number of the last batch after which new episodes begin
 
     def begin(self, number: int = 0) -> None:

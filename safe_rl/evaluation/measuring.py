@@ -121,7 +121,8 @@ class Trial:
             policy = self.policy(env)  # before an earlier recording is removed: it may not fit
             recorder = None
             if record is not None:
-                recorder = StepRecorder(Recording(record, env.cost_keys, env.interface))
+                known = {"is_privileged": bool(env.privileged_layout)}
+                recorder = StepRecorder(Recording(record, env.cost_keys, env.interface, **known))
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,

@@ -17,10 +17,11 @@ from safe_rl.models.encoders import (
     Body,
     Observed,
     RecurrentLayer,
+    critic_entries,
     observed_entries,
 )
 from safe_rl.models.heads import AUTO, Head, make_head
-from safe_rl.models.input_scales import RunningScale, input_scale_vector
+from safe_rl.models.input_scales import RunningScale
 from safe_rl.models.networks import Chain, Tanh, assemble_actor, perceptron
 
 _AS_IT_IS: Mapping[str, Any] = {"vector": []}
@@ -34,6 +35,7 @@ def build_networks(
     *,
     num_costs: int,
     device: torch.device,
+    privileged_layout: Mapping[str, slice] | None = None,
 ) -> dict[str, Any]:
     """Build an actor, a reward critic and, for ``num_costs`` > 0, a cost critic.
 
@@ -47,17 +49,28 @@ def build_networks(
         layout: Component -> columns of the flat observation.
         num_costs: Outputs of the cost critic.
         device: Device of all parameters.
+        privileged_layout: Component -> columns of the entry ``privileged``, which critics read if
+            ``model.critic_observes`` names it.
 
     Raises:
         ValueError: If the configuration does not fit the environment.
     """
     entries, normalise = observed_entries(observation_spec), model.get("normalise")
     encoders = model.get("encoders")
-    observed = Observed(entries, layout, model["input_scale"], clip=normalise, encoders=encoders)
+    layouts = {"observation": layout, "privileged": privileged_layout or {}}
+    observed = Observed(entries, layouts, model["input_scale"], clip=normalise, encoders=encoders)
+    read = critic_entries(model.get("critic_observes"), observation_spec)
     if encoders is not None and not encoders["vector"] and observed.is_vector:
         raise ValueError(
             "model=cnn encodes pictures, and this environment observes only a vector. Use "
             "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
+        )
+    if encoders is None and not observed.is_vector:
+        pictures = any(len(entry.shape) == 3 for entry in entries)
+        advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
+        raise ValueError(
+            f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
+            f"vector: use {advice}, or {TO_FLATTEN}."
         )
     widths = list(model["hidden_sizes"])
     recurrent_size = model["memory"]["size"] if model.get("memory") else 0
@@ -70,9 +83,11 @@ def build_networks(
     head = make_head(kind, action_spec, initial_log_std=log_std, device=device)
     actor = _actor(observed, head, widths, recurrent_size, device)
 
+    seen = observed._replace(entries=read)
+
     def critic(num_outputs: int, out_key: str) -> TensorDictModule:
-        body = _body(observed, num_outputs, widths, recurrent_size, device)
-        in_keys = [*observed.keys, RECURRENT] if recurrent_size else observed.keys
+        body = _body(seen, num_outputs, widths, recurrent_size, device)
+        in_keys = [*seen.keys, RECURRENT] if recurrent_size else seen.keys
         return TensorDictModule(body, in_keys=in_keys, out_keys=[out_key])
 
     networks: dict[str, Any] = {"actor": actor, "critic": critic(1, "state_value")}
@@ -110,19 +125,11 @@ def _body(
 ) -> nn.Module:
     """From observations and the recurrent state to outputs; a plain perceptron where possible."""
     first = observed.entries[0]
-    if observed.encoders is None and not observed.is_vector:
-        pictures = any(len(entry.shape) == 3 for entry in observed.entries)
-        advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
-        raise ValueError(
-            f"This environment observes {', '.join(map(str, observed.entries))}, but model=mlp "
-            f"takes one vector: use {advice}, or {TO_FLATTEN}."
-        )
-    if observed.encoders is not None or recurrent_size:
+    if observed.encoders is not None or recurrent_size or len(observed.entries) > 1:
         plain = observed._replace(encoders=observed.encoders or _AS_IT_IS)
         return Body(plain, num_outputs, widths, extra=recurrent_size, device=device)
     size = first.shape[0]
     if observed.clip is None:
-        scale = input_scale_vector(observed.input_scale, observed.layout, size)
-        return perceptron(size, num_outputs, widths, scale, device)
+        return perceptron(size, num_outputs, widths, observed.scale(first), device)
     running = RunningScale(size, key=first.key, clip=observed.clip, device=device)
     return nn.Sequential(running, *perceptron(size, num_outputs, widths, None, device))

@@ -53,6 +53,32 @@ def observed_entries(observation_spec: Composite) -> list[Entry]:
     return [_entry(("observation", name), name, observed[name]) for name in names]
 
 
+def critic_entries(chosen: Sequence[str] | None, observation_spec: Composite) -> list[Entry]:
+    """Return the entries that critics read.
+
+    Args:
+        chosen: ``model.critic_observes``, of ``observation`` and ``privileged``; None: the
+            observation.
+        observation_spec: Spec of the observations of N environments.
+
+    Raises:
+        ValueError: If the environment does not write an entry.
+    """
+    entries: list[Entry] = []
+    for name in chosen or ["observation"]:
+        if name == "observation":
+            entries += observed_entries(observation_spec)
+        elif name in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
+            entries.append(_entry(name, name, observation_spec[name]))
+        else:
+            raise ValueError(
+                f"model.critic_observes: this environment writes no '{name}'. Set "
+                "env.observe_privileged=true in Safety Gym, or name an entry with env=gymnasium "
+                "and env=torchrl: env.privileged=…"
+            )
+    return entries
+
+
 def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
     shape = tuple(spec.shape[1:])
     if len(shape) not in (1, 3):
@@ -68,7 +94,7 @@ class Observed(NamedTuple):
 
     Attributes:
         entries: The observed entries.
-        layout: Component -> columns of the flat observation.
+        layouts: Key of a vector with several components -> component -> its columns.
         input_scale: Component -> factor.
         clip: Bound of columns normalised by running moments; None without normalisation.
         encoders: Settings of the encoders of entries; None if the observation is one vector, which
@@ -76,7 +102,7 @@ class Observed(NamedTuple):
     """
 
     entries: Sequence[Entry]
-    layout: Mapping[str, slice]
+    layouts: Mapping[str, Mapping[str, slice]]
     input_scale: Mapping[str, float]
     clip: float | None
     encoders: Mapping[str, Any] | None
@@ -90,6 +116,22 @@ class Observed(NamedTuple):
     def is_vector(self) -> bool:
         """Whether there is one entry, a vector."""
         return len(self.entries) == 1 and len(self.entries[0].shape) == 1
+
+    def scale(self, entry: Entry) -> Tensor | None:
+        """Factors [n] of the columns of a vector; None if all are 1."""
+        # an entry of a dictionary may have the name "observation", too
+        layout = self.layouts.get(entry.key) if isinstance(entry.key, str) else None
+        layout = layout or {entry.name: slice(0, entry.shape[0])}
+        return input_scale_vector(self.input_scale, layout, entry.shape[0])
+
+    def scales(self) -> Tensor | None:
+        """Factors of the columns of all entries, which are vectors; None if all are 1."""
+        found = [self.scale(entry) for entry in self.entries]
+        if all(scale is None for scale in found):
+            return None
+        sizes = [entry.shape[0] for entry in self.entries]
+        parts = zip(found, sizes, strict=True)
+        return torch.cat([torch.ones(n) if scale is None else scale for scale, n in parts])
 
 
 class Body(nn.Module):
@@ -144,9 +186,7 @@ class Pixels(nn.Module):
 
 def _vector(entry: Entry, observed: Observed, device: torch.device | None) -> nn.Module:
     size, widths = entry.shape[0], list(observed.encoders["vector"])  # type: ignore[index]
-    # an entry of a dictionary may have the name "observation", too
-    layout = observed.layout if entry.key == "observation" else {entry.name: slice(0, size)}
-    scale = input_scale_vector(observed.input_scale, layout, size)
+    scale = observed.scale(entry)
     layers: list[nn.Module] = []
     if observed.clip is not None:  # normalisation makes input scales unnecessary
         layers.append(RunningScale(size, key=entry.key, clip=observed.clip, device=device))

@@ -72,14 +72,15 @@ class QEnsemble(TensorDictModuleBase):
     """E Q functions of observation and action as one module, without vmap.
 
     Args:
-        observation_size: Length of the flat observation.
+        observation_size: Length of the flat observation, or of all entries before the action
+            together.
         action_size: Length of the action.
         hidden_sizes: Width of every hidden layer.
         num_networks: E.
         num_outputs: Values per network: 1 for the reward, K for K costs.
-        input_scale: Fixed factors of the observation, or None.
+        input_scale: Fixed factors of these entries, or None.
         device: Device of the parameters.
-        in_keys: Keys of observation and action.
+        in_keys: Keys of the observation (and of further entries that critics read) and the action.
         out_key: Key of the values.
 
     Examples:
@@ -111,7 +112,8 @@ class QEnsemble(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return values [E, …, n] in a new TensorDict of shape [E, …], for steps […]."""
-        values = self.values(*(tensordict[key] for key in self.in_keys))
+        *entries, action = (tensordict[key] for key in self.in_keys)
+        values = self.values(torch.cat(entries, -1), action)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
     def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:

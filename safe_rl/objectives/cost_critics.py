@@ -58,7 +58,6 @@ class CostCritics(QFunctionLoss):
         reward_unit: r, the standard deviation of the rewards of all steps; 1 while they are equal.
     """
 
-    _in_keys: list[NestedKey]
     out_keys: list[str]
     cost_qvalue_network: TensorDictModuleBase
     cost_qvalue_network_params: TensorDictParams
@@ -91,7 +90,8 @@ class CostCritics(QFunctionLoss):
                 f"There are {number} networks of cost critics, and "
                 f"{type(self.cost_values).__name__} takes {self.cost_values.networks} for each one."
             )
-        self.cost_keys = list(cost_keys)  # the base's constructor makes in_keys of them
+        # the base's constructor makes in_keys of these
+        self.cost_keys, self._read = list(cost_keys), list(cost_qvalue_network.in_keys[:-1])
         if multiplier.num_costs != len(self.cost_keys):
             raise ValueError(f"{multiplier.num_costs} multipliers for the costs {self.cost_keys}.")
         super().__init__(actor_network, qvalue_network, **settings)
@@ -112,7 +112,8 @@ class CostCritics(QFunctionLoss):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        self._in_keys = [*self._in_keys, *(("next", key) for key in self.cost_keys)]
+        following = (("next", key) for key in (*self._read, *self.cost_keys))
+        self._in_keys = list(dict.fromkeys([*self._in_keys, *self._read, *following]))
 
     def values_of_costs(
         self,

@@ -23,14 +23,17 @@ class Ensemble(Protocol):
     """A network that evaluates several Q functions in one call, such as a `QEnsemble`."""
 
     num_networks: int  # E
-    in_keys: Sequence[NestedKey]  # of observation and action
+    in_keys: Sequence[NestedKey]  # of what it reads in a state, and last of the action
 
     def layers(self, params: TensorDictBase) -> Any:
         """Convert parameters to the argument of `values`."""
         ...
 
     def values(self, observation: Tensor, action: Tensor, layers: Any) -> Tensor:
-        """Values [E, ..., n] without TensorDicts, whose overhead exceeds the computation."""
+        """Values [E, ..., n] without TensorDicts, whose overhead exceeds the computation.
+
+        If the network reads several entries of a state, `observation` has them side by side.
+        """
         ...
 
 
@@ -98,8 +101,16 @@ class QFunctionLoss(ReplayLoss):
 
     gamma: float
     loss_function: str
+    qvalue_network: Ensemble
+    _in_keys: list[NestedKey]
     # TorchRL's TD3 replaces this property by a list, with which `select_out_keys` fails
     out_keys = LossModule.out_keys
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        # TorchRL's losses name only what the actor reads in the next state
+        following = [("next", key) for key in self.qvalue_network.in_keys[:-1]]
+        self._in_keys = list(dict.fromkeys([*self._in_keys, *following]))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -188,7 +199,9 @@ class QFunctionLoss(ReplayLoss):
         if (name, kind) not in cache:
             params = getattr(self, f"{'target_' if kind == 'target' else ''}{name}_params")
             cache[name, kind] = network.layers(params.data if kind == "frozen" else params)
-        return network.values(require(steps, network.in_keys[0]), action, cache[name, kind])
+        entries = [require(steps, key) for key in network.in_keys[:-1]]
+        observation = entries[0] if len(entries) == 1 else torch.cat(entries, -1)
+        return network.values(observation, action, cache[name, kind])
 
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """An entry below ``next`` that holds one number per step, [..., 1].

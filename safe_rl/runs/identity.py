@@ -88,7 +88,12 @@ All other keys are EXPERIMENT.
 
 # keys that configurations of archived runs lack -> the values that these runs had; keys with these
 # values are left out of comparisons
-_SILENT: dict[str, Hashable] = {"env.physics": "cpu", "env.physics_buffers": 2.0}
+_SILENT: dict[str, Hashable] = {
+    "env.physics": "cpu",
+    "env.physics_buffers": 2.0,
+    "env.observe_privileged": False,
+    "model.critic_observes": ("observation",),
+}
 
 
 def role_of(key: str) -> Role:

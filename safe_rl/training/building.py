@@ -73,7 +73,8 @@ def build_trainer(
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
     writer = RunWriter(Run(directory), config, cost_limits, env.max_episode_steps)
-    recording = Recording(writer.run.transitions_folder, env.cost_keys, env.interface)
+    known = {"interface": env.interface, "is_privileged": bool(env.privileged_layout)}
+    recording = Recording(writer.run.transitions_folder, env.cost_keys, **known)
     return Trainer(
         env=env,
         algorithm=algorithm,

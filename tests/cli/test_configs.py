@@ -73,6 +73,10 @@ def test_presets_replace_keys_of_an_algorithm():
     config = compose_config("algo=sac_lagrangian", "preset=hard_tasks")
     assert list(config.transforms) == ["observed_costs", "action_repeat"]
     assert (config.loss.gamma, config.memory.n_steps) == (0.98, 3)
+    config = compose_config("algo=sac_lagrangian", "preset=privileged")
+    assert list(config.transforms) == ["action_repeat"]
+    assert config.env.observe_privileged
+    assert config.model.critic_observes == ["observation", "privileged"]
 
 
 @pytest.mark.parametrize("algo", LAGRANGIAN)

@@ -22,8 +22,8 @@ class Privileged:
 
     Its components are `last_costs` and `cost_traces` (a column per cost key), `<kind>_position`
     and, of bodies that can be pushed, `<kind>_velocity` (x, y, z of every object; m, m/s),
-    `buttons_timer` (steps until buttons have an effect again) and `since_goal` (steps since the
-    goal changed, as a share of the longest episode).
+    `buttons_timer` (steps until buttons have an effect again, as a share of those after a goal) and
+    `since_goal` (steps since the goal changed, as a share of the longest episode).
 
     Args:
         world: The worlds.
@@ -68,6 +68,8 @@ class Privileged:
         last, traces, since_goal = self.memory.values()
         positions = (world.positions - world.robot_pos.unsqueeze(1)) @ world.robot_mat
         velocities = world.velocities @ world.robot_mat
-        counts = [world.buttons_timer, since_goal / world.scene.config.num_steps]
+        config = world.scene.config
+        timer = world.buttons_timer / max(1, config.buttons_resampling_delay)
+        counts = [timer, since_goal / config.num_steps]
         values = [last, traces, positions.flatten(1), velocities.flatten(1)]
         return torch.cat([*values, *(count.unsqueeze(1) for count in counts)], 1).float()

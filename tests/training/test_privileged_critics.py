@@ -1,0 +1,137 @@
+"""Critics that read what policies do not (`model.critic_observes`), on- and off-policy."""
+
+import pytest
+import torch
+from run_configs import compose_config, without_times
+
+import safe_rl
+from safe_rl.algorithms import OffPolicy, OnPolicy
+from safe_rl.collectors.recording import read_recording
+from safe_rl.envs import make_env
+from safe_rl.evaluation.policies import pack_policy
+
+READ = {"model.critic_observes": ["observation", "privileged"], "env.observe_privileged": True}
+SMALL = {"num_envs": 4, "frames_per_batch": 80, "frames": 240, "num_threads": 1, "seed": 3}
+SMALL |= {"logger": "none", "env.num_steps": 20, "model.hidden_sizes": [8]}
+SMALL |= {"certificate.episodes": 0, "checkpoint.interval": 0}
+REPLAY = {"exploration.random_steps": 80, "memory.batch_size": 16, "memory.keep": True}
+REPLAY |= {"evaluation": None, "policy_update.updates_per_step": 0.2}
+BATCH = {"policy_update.minibatch_size": 40}
+RUNS = {
+    "sac": ("sac_lagrangian", {**REPLAY, "preset": "privileged", **SMALL}),
+    "td3": ("td3_lagrangian", {**REPLAY, "memory.n_steps": 3}),
+    "cal": ("cal", REPLAY),
+    "wcsac": ("wcsac", REPLAY),
+    "cpo": ("cpo", {}),
+    "normalise": ("trpo_lagrangian", {"model.normalise": 10}),
+    "dict": ("ppo_lagrangian", {**BATCH, "model": "dict", "env.observation_flatten": False}),
+    "gru": ("ppo_lagrangian", {**BATCH, "model": "gru"}),
+    "workers": (
+        "ppo_lagrangian", {**BATCH, "collector": "process", "collector.num_collectors": 2}
+    ),
+    "compiled": ("ppo_lagrangian", {**BATCH, "compile": True}),
+}  # fmt: skip
+
+
+def train(folder, name, **more):
+    algo, settings = RUNS[name]
+    return safe_rl.train("PointGoal2", algo=algo, directory=folder, **(SMALL | settings | more))
+
+
+def words(*more):
+    settings = {key: x for key, x in SMALL.items() if "certificate" not in key} | READ
+    return [*(f"{key}={str(x).replace(' ', '')}" for key, x in settings.items()), *more]
+
+
+def make(*, known=True):
+    return make_env("PointGoal2", num_envs=4, seed=0, num_threads=1, observe_privileged=known)
+
+
+@pytest.mark.parametrize(("kind", "algo"), [(OffPolicy, "sac_lagrangian"), (OnPolicy, "cpo")])
+def test_critics_read_it_and_the_policy_does_not(kind, algo):
+    env = make()
+    algorithm = kind.from_config(compose_config("env=PointGoal2", *words(f"algo={algo}")), env)
+    step = env.rollout(1)[:, 0]
+    other = step.clone().set("privileged", step["privileged"] + 1)
+    assert algorithm.policy.in_keys == ["observation"]
+    for name in ("critic", "cost_critic"):
+        critic = algorithm.networks[name]
+        before, after = (critic(x.clone()).get(critic.out_keys[0]) for x in (step, other))
+        assert (before != after).any()
+    # as before without the key, and with the default
+    for entry in ("[observation]", "null"):
+        config = compose_config("env=PointGoal2", *words(f"algo={algo}"))
+        config.model.critic_observes = None if entry == "null" else ["observation"]
+        critic = kind.from_config(config, env).networks["critic"]
+        assert "privileged" not in critic.in_keys
+
+
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "cpo"])
+def test_an_environment_without_it_is_refused(algo):
+    config = compose_config("env=PointGoal2", *words(f"algo={algo}"))
+    kind = OffPolicy if algo == "sac_lagrangian" else OnPolicy
+    with pytest.raises(ValueError, match=r"critic_observes.* Set env\.observe_privileged=true"):
+        kind.from_config(config, make(known=False))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in ("workers", "compiled") else name
+        for name in RUNS
+    ],
+)
+def test_runs_learn_resume_and_act_without_it(name, tmp_path):
+    whole = train(tmp_path / "whole", name, **READ)
+    stop = lambda row: row["epoch"] < 2  # noqa: E731
+    train(tmp_path / "halves", name, **READ, callbacks=[stop])
+    safe_rl.resume(tmp_path / "halves")
+    table, expected = (
+        without_times(tmp_path / run / "progress.csv") for run in ("halves", "whole")
+    )
+    assert table == expected
+    assert len(table) == 4
+    plain = {"env": {"observe_privileged": False}, "num_threads": 1}
+    result = safe_rl.evaluate(whole.directory, episodes=4, num_envs=2, **plain)
+    assert result.estimates["episode_cost"].value >= 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "cpo"])
+def test_the_entry_alone_changes_nothing(algo, tmp_path):
+    settings = SMALL | (REPLAY if algo == "sac_lagrangian" else {})
+    tables = []
+    for known in (False, True):
+        folder, more = tmp_path / str(known), {"env.observe_privileged": known}
+        safe_rl.train("PointGoal2", algo=algo, directory=folder, **settings, **more)
+        tables.append(without_times(folder / "progress.csv"))
+    assert tables[0] == tables[1]
+
+
+@pytest.mark.long
+def test_its_columns_are_normalised(tmp_path):
+    run = train(tmp_path / "run", "normalise", **READ)
+    state = torch.load(sorted((run.directory / "checkpoints").iterdir())[-1], weights_only=True)
+    assert "critic" in str(state)
+
+
+@pytest.mark.long
+def test_an_exported_policy_does_not_need_it(tmp_path):
+    run = train(tmp_path / "run", "sac", **READ)
+    pack_policy(run.directory, tmp_path / "packed", "last")
+    policy = safe_rl.load(tmp_path / "packed").policy
+    step = make(known=False).reset()
+    assert policy(step)["action"].shape == (4, 2)
+
+
+@pytest.mark.long
+def test_offline_data_must_have_it(tmp_path):
+    known = train(tmp_path / "known", "td3", **READ, record=True).directory / "transitions"
+    assert read_recording(known)["next", "privileged"].shape[-1] == 105
+    plain = train(tmp_path / "plain", "td3", record=True).directory / "transitions"
+    offline = {"dataset.alone": True, "exploration.random_steps": 0, "memory.n_steps": 1}
+    run = train(tmp_path / "offline", "td3", **READ, **offline, **{"dataset.path": str(known)})
+    assert run.table["policy_num_updates"].sum() > 0
+    with pytest.raises(ValueError, match=r"no privileged, which critics read: .*critic_observes"):
+        train(tmp_path / "no", "td3", **READ, **offline, **{"dataset.path": str(plain)})
