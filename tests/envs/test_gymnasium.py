@@ -61,7 +61,7 @@ def test_steps_are_those_of_the_batched_environment(env_id, name, keys):
     batch = make_env({**env_node(name), **keys}, seed=11)
     observation, _ = single.reset(seed=11)
     tensordict, generator = batch.reset(), np.random.default_rng(0)
-    costs, ends = [], 0
+    costs, begun, ends = [], [], 0
     for _ in range(200):
         np.testing.assert_array_equal(observation, tensordict["observation"][0])
         action = generator.uniform(0.4, 1, single.action_space.shape).astype(np.float32)
@@ -71,10 +71,14 @@ def test_steps_are_those_of_the_batched_environment(env_id, name, keys):
         step = step["next"]
         assert (reward, terminated) == (step["reward"].item(), step["terminated"].item())
         assert truncated == step["truncated"].item()
+        total = info.pop("episode_cost", None)
         assert set(info) == {*batch.cost_keys, "goal_met"} & set(step.keys())
         assert {key: step[key].item() for key in info} == info
         costs.append(info["cost"])
+        begun += [info["cost"]]
+        assert total == (sum(begun) if terminated or truncated else None)
         if terminated or truncated:
+            begun = []
             observation, _ = single.reset()
             ends += 1
     assert ends > 0

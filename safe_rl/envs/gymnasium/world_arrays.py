@@ -15,6 +15,7 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
+from safe_rl.envs.costs import COST
 from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
@@ -27,6 +28,7 @@ from safe_rl.envs.velocity.velocity_config import (
 )
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
+EPISODE_COST = "episode_cost"  # the sum over an episode, in the info of its last step
 NUM_SEEDS = 2**62
 RENDER_MODES = ["rgb_array"]
 
@@ -71,6 +73,7 @@ class Worlds:
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        self._episode_cost = np.zeros(self.batch.batch_size.numel())  # since the last reset
         rate = max(1, round(1 / self.batch.seconds_per_step))  # of real time
         self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
 
@@ -116,6 +119,7 @@ class Worlds:
         ask = None
         if mask is not None:
             ask = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
+        self._episode_cost[slice(None) if mask is None else mask] = 0.0
         # TorchRL's `reset` would return zeros for the other rows
         return arrays_of(self.batch._reset(ask)["observation"])
 
@@ -129,6 +133,7 @@ class Worlds:
         column = {name: step[name].squeeze(-1).cpu().numpy() for name in names}
         infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
         infos |= {key: column[key] for key in self.batch.events}
+        self._episode_cost += infos[COST]
         values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
         return arrays_of(step["observation"]), values, infos
 
