@@ -7,7 +7,6 @@ from pathlib import Path
 
 import equations
 import links
-import marks
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -57,8 +56,8 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Put tables in, and lead links to files outside of `docs/` to their pages."""
-    return links.rewrite(marks.fill(markdown), page.file.src_uri, ROOT)
+    """Lead links to files outside of `docs/` to their pages."""
+    return links.rewrite(markdown, page.file.src_uri, ROOT)
 
 
 def on_page_content(content: str, **_: object) -> str:

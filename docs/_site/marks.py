@@ -1,4 +1,7 @@
-"""What pages ask for: `<!-- made: name words -->` becomes a table or a file of the program."""
+"""What pages ask for: between `<!-- made: name words -->` and `<!-- end -->`, tables and files.
+
+``python docs/_site/marks.py`` writes all of them again, from the program and from ``results/``.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,9 @@ import result_tables
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs" / "algorithms"
-_MARK = re.compile(r"<!-- made: (\w+) ?(.*?) -->")
+_MARK = re.compile(
+    r"(<!-- made: (\w+) ?([^\n]*?) -->\n)(?:(?!<!-- made).)*?(<!-- end -->\n)", re.DOTALL
+)
 _HEAD = "| `algo=` | problem it solves | policy step | source |\n|---|---|---|---|"
 
 
@@ -19,10 +24,7 @@ def conf(names: str) -> str:
     """Files of ``conf/`` as they are: their comments explain every key."""
     paths = [path for name in names.split() for path in sorted((ROOT / "conf").glob(name))]
     assert paths, f"there is no conf/{names}"
-    blocks = [
-        f'```yaml title="conf/{path.relative_to(ROOT / "conf")}"\n{path.read_text()}```'
-        for path in paths
-    ]
+    blocks = [f"`{path.relative_to(ROOT)}`:\n\n```yaml\n{path.read_text()}```" for path in paths]
     return "\n\n".join(blocks)
 
 
@@ -59,10 +61,19 @@ TABLES: dict[str, Callable[..., str]] = {
 }
 
 
-def fill(markdown: str) -> str:
-    """Put the tables where a page asks for them.
+def fill(page: str) -> str:
+    """The text of a page with the tables that it asks for.
 
     Raises:
         KeyError: If there is no such table.
     """
-    return _MARK.sub(lambda match: TABLES[match[1]](*filter(None, [match[2]])), markdown)
+
+    def made(match: re.Match[str]) -> str:
+        return f"{match[1]}\n{TABLES[match[2]](*filter(None, [match[3]]))}\n\n{match[4]}"
+
+    return _MARK.sub(made, page)
+
+
+if __name__ == "__main__":
+    for path in (ROOT / "README.md", *(ROOT / "docs").rglob("*.md")):
+        path.write_text(fill(path.read_text()))

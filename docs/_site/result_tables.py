@@ -1,12 +1,10 @@
 """Tables of results for the pages, made from the archived runs in ``results/``.
 
-A page has a mark where a table goes: ``<!-- made: held_out -->``. README's table is stored in the
-page; ``python docs/_site/result_tables.py`` writes it again.
+A page has marks where a table goes, see ``marks.py``.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -21,6 +19,7 @@ from safe_rl.envs import SUITE
 from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.slates import paper_table
+from safe_rl.scores.benchmark import ALGORITHMS
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT, SPAN, MILLION = 25.0, 20_000, 1_000_000
@@ -42,6 +41,8 @@ OMNISAFE = {
     "SafeSwimmerVelocity": "28.0 ± 4.1 / 65 ± 18",
     "SafeWalker2dVelocity": "13.5 ± 14.6 / 2982 ± 682",
 }
+# campaigns with the default settings and three million steps
+_THREE_MILLION = ("reference", "held_out", "eighteen")
 Rows = list[dict[str, Any]]
 
 
@@ -153,12 +154,18 @@ def table(rows: Iterable[Mapping[str, Any]], *columns: str) -> str:
 
 def held_out() -> str:
     """Constrained algorithms on held-out seeds after three million steps."""
-    ends = ("cost", "return", "since", "above", "rate", "certified", "new")
-    rows = summaries("held_out", MILLION / 2, MILLION) + summaries("eighteen", MILLION / 2, MILLION)
-    return table(rows, "environment", "algorithm", "seeds", *ends)
+    return table(summaries("held_out", MILLION / 2, MILLION), *_LONG)
 
 
-_SHORT = ("seeds", "cost", "return", "above", "rate", "certified")
+def further() -> str:
+    """The paper's algorithms on seven further environments, as far as the campaign is."""
+    rows = summaries("eighteen", MILLION / 2, MILLION)
+    return table(rows, *_LONG) if rows else "No archived runs yet."
+
+
+_SHORT = ("cost", "return", "above", "rate", "certified", "seeds")
+_LONG = ("environment", "algorithm", "cost", "return", "rate", "certified", "since", "above")
+_LONG += ("new", "seeds")
 
 
 def compared(env: str) -> str:
@@ -196,7 +203,7 @@ def single(campaign: str) -> str:
         rows.append(row)
     settings = ["name"] if campaign in ("one_transform", "push", "doggo") else []
     ends = ("cost", "return", "rate", "bound")
-    return table(rows, "environment", *settings, "seed", "steps", *names, *ends)
+    return table(rows, "environment", *settings, "seed", *ends, "steps", *names)
 
 
 def parts() -> str:
@@ -215,7 +222,7 @@ def parts() -> str:
 def rivals() -> str:
     """Published values of other implementations beside ours, favourable or not."""
     told = yaml.safe_load((ROOT / "safe_rl" / "scores" / "published.yaml").read_text())
-    rows = summaries("reference", MILLION / 2) + summaries("held_out", MILLION / 2)
+    rows = [row for name in _THREE_MILLION for row in summaries(name, MILLION / 2)]
     for row in rows:
         env, algo = row["environment"], row["algorithm"].strip("`")
         theirs = told["reimplementations"]["scores"].get(env, {}).get(algo)
@@ -223,12 +230,12 @@ def rivals() -> str:
         for name, pair in (("omnisafe", theirs), ("paper", paper)):
             row[name] = f"{pair[1]:.1f} / {pair[0]:.1f}" if pair else "—"
     rows.sort(key=lambda row: [*SUITE].index(row["environment"]))
-    return table(rows, "environment", "algorithm", "seeds", "cost", "return", "omnisafe", "paper")
+    return table(rows, "environment", "algorithm", "cost", "return", "omnisafe", "paper", "seeds")
 
 
 def paper_tables() -> str:
     """The paper's Tables 1 and 2 from our runs of three million steps."""
-    found = [run for name in ("held_out", "reference") for run in runs(name).run]
+    found = [run for name in _THREE_MILLION for run in runs(name).run]
     made = paper_table(group_runs(found, suite())[0])
     return markdown(made.columns, [[cell.text for cell in row] for row in made.rows()])
 
@@ -236,31 +243,45 @@ def paper_tables() -> str:
 def paper_preset() -> str:
     """Runs with the paper's preset, over the last five epochs."""
     rows = summaries("paper_preset", 5 * 30_000, by=("name", "algorithm"))
-    return table(rows, "algorithm", "steps", "seeds", "cost", "return", "rate")
+    return table(rows, "algorithm", "cost", "return", "rate", "steps", "seeds")
 
 
 def velocity_runs() -> str:
     """PPO-Lagrangian below limits of speed, beside what OmniSafe publishes."""
     rows = summaries("velocity", MILLION / 4, 3 * MILLION / 4, 0)
     rows = [row | {"omnisafe": OMNISAFE[row["environment"]]} for row in rows]
-    return table(rows, "environment", "seeds", "cost", "return", "above", "omnisafe")
+    return table(rows, "environment", "cost", "return", "above", "omnisafe", "seeds")
 
 
 def coverage() -> str:
-    """Which environments of the benchmark have runs: number of seeds, by algorithm and length."""
-    campaigns = {"algorithms": "defaults, 1M steps", "held_out": "defaults, 3M"}
-    campaigns |= {"eighteen": "defaults, 3M"}
-    campaigns |= {"reference": "defaults, 3M", "held_actions": "hard_tasks"}
-    campaigns |= {"paper_preset": "paper's settings", "doggo": "other"}
-    found = pandas.concat([runs(name).assign(what=what) for name, what in campaigns.items()])
+    """What each environment of the benchmark has: seeds × million steps of finished runs."""
+    own = ("algorithms", "doggo", *_THREE_MILLION)
+    found = pandas.concat([runs(name).query("name == ''").assign(what="own") for name in own])
+    others = {"held_actions": "`preset=hard_tasks`", "paper_preset": "paper's settings"}
+    found = pandas.concat([found, *(runs(name).assign(what=what) for name, what in others.items())])
+    found = found[[run.is_finished for run in found.run]]
+    shown = [*ALGORITHMS, "sac_lagrangian", "td3_lagrangian"]
     rows: Rows = []
     for env in (name for name in SUITE if not name.endswith("0")):
-        row = dict.fromkeys(campaigns.values(), "—") | {"environment": env}
-        for what, group in found[found.environment == env].groupby("what"):
-            seeds = group.groupby("algorithm").seed.nunique()
-            row[what] = ", ".join(f"{algo} ({n})" for algo, n in seeds.items())
-        rows.append(row)
-    return table(rows, "environment", *dict.fromkeys(campaigns.values()))
+        here = found[found.environment == env]
+        row = {name: seeds(here.query("what == 'own' and algorithm == @name")) for name in shown}
+        rest = here.query("what == 'own' and algorithm not in @shown")
+        row["others"] = seeds(rest, by_name=True)
+        row |= {what: seeds(here[here.what == what], by_name=True) for what in others.values()}
+        rows.append({"environment": env} | {name: cell or "—" for name, cell in row.items()})
+    return markdown((f"`{n}`" if n in shown else n for n in rows[0]), (r.values() for r in rows))
+
+
+def seeds(group: pandas.DataFrame, *, by_name: bool = False) -> str:
+    """Seeds × million steps of some runs: ``5 × 3M, 3 × 1M``; ``by_name`` with their algorithms."""
+    lengths = [-round(run.steps / MILLION, 1) for run in group.run]
+    cells: dict[tuple[float, int], list[str]] = {}
+    for (length, algo), own in group.assign(length=lengths).groupby(["length", "algorithm"]):
+        cells.setdefault((length, own.seed.nunique()), []).append(f"`{algo}`")
+    return ("; " if by_name else ", ").join(
+        f"{n} × {-length:g}M" + (f": {', '.join(names)}" if by_name else "")
+        for (length, n), names in cells.items()
+    )
 
 
 def readme() -> str:
@@ -278,15 +299,5 @@ def readme() -> str:
     )
 
 
-def fill_readme(text: str) -> str:
-    """README with its table made again."""
-    mark = "<!-- table of docs/_site/result_tables.py -->\n"
-    return re.sub(f"(?<={mark})(\\|.*\n)+", lambda _: readme() + "\n", text)
-
-
-TABLES = (held_out, rivals, paper_preset, coverage, compared, measured, single, parts)
-TABLES += (velocity_runs, paper_tables)
-
-if __name__ == "__main__":
-    page = ROOT / "README.md"
-    page.write_text(fill_readme(page.read_text()))
+TABLES = (held_out, further, rivals, paper_preset, coverage, compared, measured, single, parts)
+TABLES += (velocity_runs, paper_tables, readme)
