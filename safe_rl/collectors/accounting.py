@@ -74,6 +74,7 @@ class EpisodeStatistics:
             nested keys are joined by ``/``.
         lengths: Steps of every finished episode, shape [E].
         steps_per_decision: Environment steps per time step of a batch, which is one action.
+        steps: Environment steps of the batch.
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
         reward_rate: All reward so far divided by all steps so far, a scalar tensor.
         open_costs: Cost key -> cost that the unfinished episode of every row had before the batch,
@@ -98,6 +99,7 @@ class EpisodeStatistics:
     reward_rate: Tensor = field(default_factory=lambda: torch.tensor(torch.nan))
     open_costs: dict[str, Tensor] = field(default_factory=dict)
     steps_per_decision: int = 1
+    steps: int = 0
 
     @property
     def num_episodes(self) -> int:
@@ -214,9 +216,10 @@ class EpisodeAccounting(Resumable):
         acted = {} if (action := batch.get("action", None)) is None else {"action": action}
         check_steps({**seen, **columns, **acted}, self.cost_keys)
         signals = torch.stack(list(columns.values()), -1)
-        steps = torch.ones_like(signals[..., 0])
+        steps, num_steps = torch.ones_like(signals[..., 0]), batch.numel()
         if self.steps_per_decision != 1:
             steps = self._column(batch, STEPS_TAKEN)
+            num_steps = int(steps.sum())
         signals = torch.cat([steps.unsqueeze(-1), signals], -1)
         before = self.open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
@@ -233,6 +236,7 @@ class EpisodeAccounting(Resumable):
             reward_rate=reward_rate,
             open_costs=dict(zip(names, before.unbind(-1), strict=True)),
             steps_per_decision=self.steps_per_decision,
+            steps=num_steps,
         )
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:

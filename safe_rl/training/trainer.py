@@ -256,8 +256,7 @@ class Trainer:
             learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()
         before = self.progress.steps
-        steps = batch.numel() * self._env.steps_per_decision
-        self.progress.add(steps, end - start)
+        self.progress.add(episodes.steps, end - start)
         evaluated: dict[str, float] = {}
         if self._evaluation is not None:
             with torch_threads(1):
@@ -271,7 +270,7 @@ class Trainer:
             "time_collect": collected - start,
             "time_learn": end - collected,
             "time_total": self.progress.seconds,
-            "steps_per_second": steps / (end - start),
+            "steps_per_second": episodes.steps / (end - start),
         }
 
     def _save(self) -> None:

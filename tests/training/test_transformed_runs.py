@@ -80,6 +80,16 @@ def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_p
     assert table["estimate_cost"][0] == pytest.approx(rate * length)
 
 
+def test_steps_that_a_last_decision_does_not_take_are_not_counted(tmp_path):
+    # episodes of 20 steps are seven decisions of three, the last of two steps
+    options = ["transforms=[action_repeat]", "transforms.action_repeat.k=3", "algo=ppo"]
+    options += ["frames_per_batch=84", "staggered_starts=false", "frames=160"]
+    make_trainer(tmp_path, *options).run()
+    table = read_table(tmp_path / "progress.csv")
+    assert table["steps"] == [80, 160]
+    assert table["episode_length"] == [20.0, 20.0]
+
+
 def test_batches_that_cannot_be_shared_out_among_repeats_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"4 environments that take 4 steps at a time.*144 or 160"):
         make_trainer(tmp_path, "transforms=[action_repeat]", "frames_per_batch=150")
