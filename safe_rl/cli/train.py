@@ -78,7 +78,8 @@ def prepare(words: Sequence[str]) -> list[str]:
         >>> prepare(["slate=SGPoint", "-m", "seed=0"])
         ['-m', 'seed=0', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2']
     """  # noqa: E501
-    store_configs()
+    chosen = [word.removeprefix("env=") for word in words if word.startswith("env=")]
+    store_configs((chosen or ["PointGoal1"]) if {"--help", "-h"} & {*words} else None)
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)

@@ -10,7 +10,7 @@ a module, or names a class that is not listed here. The user permits such a modu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -261,21 +261,30 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig | Veloci
     store_configs()
 
 
-def store_configs() -> None:
-    """Put all environments into Hydra's ConfigStore, as in `env=PointGoal1 env.hazards_num=3`."""
+def store_configs(whole: Container[str] | None = None) -> None:
+    """Put all environments into Hydra's ConfigStore, as in `env=PointGoal1 env.hazards_num=3`.
+
+    Args:
+        whole: Names of those that have their keys; None: all. Of the others only the names can be
+            listed. Hydra copies its store once per configuration group to print its help.
+    """
     text = {"name": Key(SAFETY_GYM, Text)}
-    ConfigStore.instance().store(SAFETY_GYM, structured("SafetyGym", text | KEYS), GROUP)
+    nodes: dict[str, Any] = {}
     for name, keys in (SUITE | EXTRAS | _STORED).items():
         base = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
-        ConfigStore.instance().store(name, {**base, "name": name, **_lists(keys)}, GROUP)
+        nodes[name] = {**base, "name": name, **_lists(keys)}
     for name, row in VELOCITY_SUITE.items():
         values = {"_target_": VELOCITY_TARGET, "name": name, **row}
         keys = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
-        ConfigStore.instance().store(name, structured(name, keys), GROUP)
+        nodes[name] = structured(name, keys)
     for name, family in FOREIGN.items():
         head = {"_target_": family.target, "name": "${.id}", "id": "???"}
         rows = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
-        ConfigStore.instance().store(name, structured(name, rows), GROUP)
+        nodes[name] = structured(name, rows)
+    if whole is not None:
+        nodes = {name: node if name in whole else {} for name, node in nodes.items()}
+    for name, node in {SAFETY_GYM: structured("SafetyGym", text | KEYS), **nodes}.items():
+        ConfigStore.instance().store(name, node, GROUP)
 
 
 # `Safexp-{name}-v0`, and `Safexp-Custom-v0` with the default of every key. They take a `config`

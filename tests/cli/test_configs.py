@@ -14,7 +14,7 @@ from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.cli import train
 from safe_rl.cli.config import check_settings
-from safe_rl.envs import EXTRAS, SUITE, env_names, env_node
+from safe_rl.envs import EXTRAS, SUITE, env_names, env_node, store_configs
 
 
 def options(group: str) -> list[str]:
@@ -100,9 +100,13 @@ def test_the_help_lists_every_environment(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["train.py", "--help"])
     with pytest.raises(SystemExit) as end:
         train.main()
+    store_configs()  # the help has stored names alone
     assert not end.value.code
     help_text = capsys.readouterr().out
     assert all(name in help_text for name in (*SUITE, *EXTRAS, "gymnasium"))
+    assert (
+        f"hazards_num: {env_node('PointGoal1')['hazards_num']}" in help_text
+    )  # the default's keys
 
 
 def test_learning_rates_are_given_by_the_names_of_parameters():
