@@ -34,6 +34,7 @@ from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded
+from safe_rl.models import HeldActions
 from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
@@ -255,9 +256,15 @@ class Run(RecordedRun):
 
     @cached_property
     def policy(self) -> TensorDictModuleBase:
-        """Its trained policy; :func:`torchrl.envs.set_exploration_type` selects mean or sample."""
+        """Its trained policy; :func:`torchrl.envs.set_exploration_type` selects mean or sample.
+
+        After training with ``transforms=[action_repeat]`` it is a `HeldActions`, which also acts
+        step by step in an environment without this transform.
+        """
         path = self.find_checkpoint(self.checkpoint)
-        return loading.load_policy(self.config, self.env, path, torch.device("cpu"))
+        policy = loading.load_policy(self.config, self.env, path, torch.device("cpu"))
+        steps = self.env.steps_per_decision
+        return policy if steps == 1 else HeldActions(policy, steps)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Its table as a data frame with a row per epoch; needs the extra ``report``."""

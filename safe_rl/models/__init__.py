@@ -2,7 +2,12 @@
 
 from safe_rl.models.bounded_actors import make_bounded_actor, make_squashed_actor
 from safe_rl.models.build_networks import build_networks
-from safe_rl.models.collecting_policies import BehaviourPolicy, ExploringPolicy, make_behaviour
+from safe_rl.models.collecting_policies import (
+    BehaviourPolicy,
+    ExploringPolicy,
+    HeldActions,
+    make_behaviour,
+)
 from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector, take_in
 from safe_rl.models.networks import make_actor, make_critic
 from safe_rl.models.q_networks import EnsembleMLP, QEnsemble
@@ -11,6 +16,7 @@ __all__ = [
     "BehaviourPolicy",
     "EnsembleMLP",
     "ExploringPolicy",
+    "HeldActions",
     "InputScale",
     "QEnsemble",
     "RunningScale",

@@ -1,4 +1,4 @@
-"""Policies for on-policy and off-policy data collection, without distribution objects."""
+"""Policies for data collection without distribution objects, and one that holds its actions."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
 from safe_rl.models.networks import Chain
+from safe_rl.naming import STEPS_TAKEN
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
@@ -140,3 +141,61 @@ class ExploringPolicy(TensorDictModuleBase):
             uniform = self.low + 2 * half * torch.rand_like(action)
             action = torch.where(self.is_random, uniform, action)
         return tensordict.set(self.out_keys[0], action)
+
+
+class HeldActions(TensorDictModuleBase):
+    """A policy that decides at every k-th step and repeats its action in between.
+
+    It is how a policy that was trained with the transform `ActionRepeat` acts in the environment
+    itself, step by step: both have the same episodes. In an environment with that transform, which
+    writes `steps_taken`, it decides at every call. Call `reset` when an episode begins, unless the
+    environment writes `is_init`.
+
+    Args:
+        policy: The policy that decides; it is not recurrent.
+        k: Steps for which an action is held.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from safe_rl.models import BehaviourPolicy, make_actor
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> policy = HeldActions(BehaviourPolicy(actor), k=2)
+        >>> steps = [TensorDict(observation=torch.randn(5, 3), batch_size=[5]) for _ in range(3)]
+        >>> first, second, third = (policy(step)["action"] for step in steps)
+        >>> bool((first == second).all()), bool((second == third).any())
+        (True, False)
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, k: int) -> None:
+        super().__init__()
+        self.policy, self.k = policy, k
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        self._taken: Tensor | None = None  # steps of the present decisions, [N]
+        self._held: Tensor | None = None
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Decide anew at the next step, in all rows or in those of a mask, bool [N]."""
+        if rows is None or self._taken is None:
+            self._taken = None
+        else:
+            self._taken = self._taken.masked_fill(rows.reshape(self._taken.shape), 0)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        if tensordict.get(STEPS_TAKEN, None) is not None:
+            decided: TensorDictBase = self.policy(tensordict)
+            return decided
+        shape = tensordict.batch_size
+        if self._taken is None or self._taken.shape != shape:
+            self._taken = torch.zeros(shape, dtype=torch.int64, device=tensordict.device)
+        if (begins := tensordict.get("is_init", None)) is not None:
+            self.reset(begins)
+        decides = self._taken % self.k == 0
+        if decides.any():
+            chosen = self.policy(tensordict.select(*self.in_keys)).get("action")
+            where = decides.reshape(*shape, *[1] * (chosen.ndim - len(shape)))
+            all_decide = self._held is None or bool(decides.all())
+            self._held = chosen if all_decide else torch.where(where, chosen, self._held)
+        self._taken = self._taken + 1
+        return tensordict.set("action", self._held)
