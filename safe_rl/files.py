@@ -45,6 +45,20 @@ def printable(text: str) -> str:
     return _CONTROLS.sub("?", text)
 
 
+def all_printable(content: Any) -> Any:
+    r"""Plain containers whose texts, also keys, are `printable`.
+
+    Examples:
+        >>> all_printable({"a\x1b": ["\x07", 3]})
+        {'a?': ['?', 3]}
+    """
+    if isinstance(content, dict):
+        return {all_printable(key): all_printable(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return type(content)(map(all_printable, content))
+    return printable(content) if isinstance(content, str) else content
+
+
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
     """Reads YAML in a tenth of OmegaConf's time, and 1e-4 as a number, as OmegaConf does.
 
@@ -83,14 +97,14 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of bounded size.
+    """Read a JSON file of bounded size, its texts without control characters.
 
     Raises:
         ValueError: If it is not JSON, is too large, or nested too deeply.
         OSError: If it cannot be read.
     """
     try:
-        return json.loads(read_bounded(path))
+        return all_printable(json.loads(read_bounded(path)))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path.name} cannot be read ({error})") from error
 

@@ -41,11 +41,11 @@ class Resumable:
         """Restore what :meth:`state_dict` has returned.
 
         Raises:
-            ValueError: If a number was saved as a value of another type.
+            ValueError: If a value is missing, or of another kind or shape than the attribute.
         """
         for name in self.state_names:
             own = getattr(self, name)
-            value = _restored(own, state_dict[name])
+            value = _restored(name, own, _entry(state_dict, name))
             if value is not own:
                 setattr(self, name, value)
 
@@ -60,18 +60,55 @@ def _saved(value: Any) -> Any:
     return value.state_dict() if hasattr(value, "state_dict") else value
 
 
-def _restored(own: Any, saved: Any) -> Any:
+def _entry(saved: Any, name: str) -> Any:
+    if not isinstance(saved, Mapping) or name not in saved:
+        raise ValueError(f"there is no '{name}'.")
+    return saved[name]
+
+
+def _restored(name: str, own: Any, saved: Any) -> Any:
     """The new value of an attribute: the saved value, or the object after it has loaded it."""
     if isinstance(own, Tensor):
+        _check_shape(name, own, saved)
         return saved.to(own, copy=True)
     if isinstance(own, Mapping):
-        return {name: _restored(part, saved[name]) for name, part in own.items()}
+        return {
+            key: _restored(f"{name}.{key}", part, _entry(saved, key)) for key, part in own.items()
+        }
     if isinstance(own, torch.Generator):
         own.set_state(saved.cpu())
+    elif isinstance(own, torch.optim.Optimizer):
+        load_optimizer(own, saved)
     elif hasattr(own, "load_state_dict"):
         own.load_state_dict(saved)
-    elif isinstance(own, int | float) and type(saved) is not type(own):
-        raise ValueError(f"there is {str(saved)[:40]!r} where a number has to be.")
+    elif isinstance(own, int | float | list) and type(saved) is not type(own):
+        raise ValueError(f"'{name}' is {str(saved)[:40]!r}, expected a {type(own).__name__}.")
     else:
         return saved
     return own
+
+
+def _check_shape(name: str, own: Tensor, saved: Any) -> None:
+    """Refuse what is no tensor of the shape of `own`; where `own` is empty, any length fits."""
+    shape = tuple(saved.shape) if isinstance(saved, Tensor) else None
+    lengths = zip(shape or (), own.shape, strict=False)
+    if shape is None or len(shape) != own.ndim or any(n != m and m for n, m in lengths):
+        found = f"a {type(saved).__name__}" if shape is None else f"of the shape {list(shape)}"
+        raise ValueError(f"'{name}' is {found}, expected the shape {list(own.shape)}.")
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, state_dict: Any) -> None:
+    """Restore an optimiser, and refuse moments of other shapes than their parameters.
+
+    Torch does not compare them, so the first step would fail instead.
+
+    Raises:
+        ValueError: If a shape differs, or torch refuses the state.
+    """
+    optimizer.load_state_dict(state_dict)
+    if not isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW | torch.optim.SGD):
+        return  # others may have moments of any shape
+    for parameter, moments in optimizer.state.items():
+        for name, moment in moments.items():
+            if isinstance(moment, Tensor) and moment.ndim:
+                _check_shape(name, parameter, moment)

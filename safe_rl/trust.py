@@ -11,6 +11,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from pkgutil import resolve_name
+from shlex import quote
 from typing import Any, cast
 
 import hydra.utils
@@ -144,7 +145,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         module = name.rpartition(".")[0] or name
         raise TargetError(
             f"{shown}: configurations reach only parts of safe_rl, torch.optim and modules of "
-            f"yours. If you trust '{module}', add import={module} to the command."
+            f"yours. If you trust '{module}', add {quote(f'import={module}')} to the command."
         )
     known, part = _ROOMS[root], name.removeprefix(f"{root}.")
     if known is not None and part not in known:
@@ -170,8 +171,8 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     if not any(f"{home}.".startswith(f"{room}.") for room in homes):
         raise TargetError(
             f"{shown}: it is defined in '{home}', which configurations do not reach, not in "
-            f"'{root}'. If you trust '{home}', add import={home} to the command and write "
-            f"_target_={home}.{found.__qualname__}."
+            f"'{root}'. If you trust '{home}', add {quote(f'import={home}')} to the command and "
+            f"write _target_={home}.{found.__qualname__}."
         )
     return found
 

@@ -63,7 +63,7 @@ def compose_run(
         config = _compose(words, name)
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise ValueError(explain(error, words)) from error
-    name_choices(config, config.hydra.runtime.choices)
+    name_choices(config, config.hydra)
     return config
 
 
@@ -78,12 +78,22 @@ def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
         GlobalHydra.instance().hydra = outside
 
 
-def name_choices(config: DictConfig, choices: Mapping[str, str]) -> None:
+def name_choices(config: DictConfig, hydra: Any) -> None:
     """Give a run the names of what was chosen: whatever was merged into it, the name is true.
 
+    Args:
+        config: The run's configuration.
+        hydra: Hydra's settings of it.
+
     Raises:
-        ValueError: If a changed environment has the name of another one of the package.
+        ValueError: If a transform is chosen twice, or a changed environment has the name of another
+            one of the package.
     """
+    for word in hydra.overrides.task:
+        names = [n.strip() for n in str(word).partition("=[")[2].rstrip("]").split(",")]
+        if word.startswith("transforms=[") and len(set(names)) < len(names):
+            raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
+    choices = hydra.runtime.choices
     if "algo" in choices:
         config.algo.name = choices["algo"].rpartition("/")[2]
     name, chosen = config.env.name, choices.get("env")

@@ -8,6 +8,7 @@ by the parts' constructors; an environment checks its own.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -241,6 +242,11 @@ def _check_all(config: DictConfig) -> None:
 
 def _check_parts(config: DictConfig) -> None:
     """Refuse what a preset or a command has added to an algorithm without such a part."""
+    updates = (config.get(name) or {} for name in ("policy_update", "critic_update"))
+    if config.get("compile") and not any("compile" in update for update in updates):
+        warnings.warn(
+            f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
+        )
     for name in _PARTS:
         part = config.get(name)
         if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):

@@ -154,10 +154,17 @@ def run_command(
     try:
         modules = [module for word in imports for module in _modules(word)] if imports else None
         return work(words[:places], read_options(words[places:], schema), modules)
-    except (ValueError, OSError, RuntimeError, ImportError, OmegaConfBaseException) as error:
+    except (
+        ValueError,
+        OSError,
+        RuntimeError,
+        ImportError,
+        MemoryError,
+        OmegaConfBaseException,
+    ) as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
-        print(f"error: {printable(str(error))}", file=sys.stderr)
+        print(f"error: {printable(str(error) or type(error).__name__)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         end_by_interrupt()

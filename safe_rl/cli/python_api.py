@@ -90,6 +90,8 @@ def train(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
+    if directory == "":
+        raise ValueError("directory is empty: it names the folder of the run.")
     if "resume" in settings:
         raise ValueError("safe_rl.resume(directory) continues a run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
@@ -146,6 +148,8 @@ def new_folder(hydra: DictConfig) -> Path:
 
     A folder that an override names is used as it is.
     """
+    if not hydra.run.dir:
+        raise ValueError("hydra.run.dir is empty: it names the folder of the run.")
     wanted = Path(hydra.run.dir).expanduser().absolute()
     if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
         return wanted

@@ -16,7 +16,7 @@ from safe_rl.cli.options import run_command
 from safe_rl.cli.user_code import import_modules
 from safe_rl.envs import SUITE, env_node, resolve
 from safe_rl.evaluation.settings import option
-from safe_rl.files import check_place
+from safe_rl.files import check_place, printable
 from safe_rl.reporting import Look, Report, build_report, write_report
 from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
@@ -108,6 +108,6 @@ def carry_out(words: list[str], options: ReportOptions, modules: list[str] | Non
     if options.archive is not None:
         print(f"kept {len(result.runs)} runs in {options.archive}")
     for path, reason in result.skipped.items():
-        print(f"left out {clean(path)}: {reason}", file=sys.stderr)
+        print(f"left out {clean(path)}: {printable(reason)}", file=sys.stderr)
     print(f"wrote {page}")
     return 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -100,5 +101,5 @@ def refuse_changes(directory: Path, config: DictConfig) -> None:
                 f"{before.get(key)}). You may change frames, keys of the machine such as "
                 "checkpoint.interval, and single numbers below loss, limits, policy_update and so "
                 "on, but not an optimiser's lr: the checkpoint has it. For a new run from this "
-                f"run's networks use init_from={directory}."
+                f"run's networks use {quote(f'init_from={quote(str(directory))}')}."
             )

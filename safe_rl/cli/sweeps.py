@@ -49,7 +49,7 @@ def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> fl
     folder = Run(directory)
     try:
         import_modules(config.get("import"))
-        name_choices(config, settings.runtime.choices)
+        name_choices(config, settings)
         check_settings(config)
         check_risk(config)
         with open_dict(config):
@@ -78,7 +78,13 @@ class Summary(Callback):
         self._log, self._process = Path(log).absolute(), os.getpid()
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Let jobs at a time share the cores."""
+        """Let jobs at a time share the cores.
+
+        Raises:
+            SystemExit: If the folder of the sweep has no name; Hydra would only warn of others.
+        """
+        if not config.hydra.sweep.dir:
+            sys.exit("hydra.sweep.dir= is empty: it names the folder of the sweep.")
         self._log.parent.mkdir(parents=True, exist_ok=True)
         workers = config.hydra.launcher.get("n_jobs")
         if workers is not None:

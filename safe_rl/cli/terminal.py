@@ -3,15 +3,22 @@
 import os
 import signal
 import sys
+import warnings
 from typing import NoReturn
+
+from safe_rl.files import printable
+
+_FORMAT = warnings.formatwarning
 
 
 def keep_streams() -> None:
     """Let the command print, whatever its streams are.
 
     A stream that is closed takes what is written, and characters that the encoding lacks, such as ≤
-    in ASCII, are escaped: neither may end a run or change the exit status.
+    in ASCII, are escaped: neither may end a run or change the exit status. Warnings, which may
+    quote files of others, are shown without control characters.
     """
+    warnings.formatwarning = lambda *parts, **names: printable(_FORMAT(*parts, **names))
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

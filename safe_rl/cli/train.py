@@ -112,6 +112,8 @@ def job(config: DictConfig) -> float | None:
     directory = Path(settings.runtime.output_dir)
     if settings.mode == RunMode.MULTIRUN:
         return run_in_sweep(config, settings, directory)
+    if not settings.run.dir:
+        sys.exit("hydra.run.dir= is empty: it names the folder of the run.")
     is_resumed = settings.job.config_name == RESUMED
     try:
         _check(config, settings, directory)
@@ -137,7 +139,7 @@ def _check(config: DictConfig, settings: HydraConf, directory: Path) -> None:
     if settings.job.config_name == RESUMED:
         refuse_changes(directory, config)
     else:
-        name_choices(config, settings.runtime.choices)
+        name_choices(config, settings)
     check_settings(config)
     check_risk(config)
 

@@ -7,6 +7,7 @@ command names them: opening another person's run does not run their code.
 
 from __future__ import annotations
 
+import shlex
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -107,7 +108,7 @@ def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, 
     """Refuse to open a run that has used modules of its own, unless ``import=`` is given."""
     noted = config.get("import") or []
     if given is None and noted:
-        words = " ".join(f"import={module}" for module in noted)
+        words = shlex.join(f"import={module}" for module in noted)
         raise ValueError(
             f"{run} was trained with {words}: add that to the command if you trust this code, or "
             f"'import=[]' to go without. In Python: safe_rl.load(…, imports=[…])."

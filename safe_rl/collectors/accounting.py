@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -199,6 +200,19 @@ class EpisodeAccounting(Resumable):
         # changes sums of rewards far less than the digits that are logged
         self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
         self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the sums.
+
+        Raises:
+            ValueError: If numbers of steps or costs are below 0, or sums are not finite. Only those
+                of an episode that is left out are NaN, all of them.
+        """
+        super().load_state_dict(state_dict)
+        sums = torch.cat([self.open_sums[~self.open_sums.isnan().all(1)], self.totals[None]])
+        # the second column has rewards
+        if not sums.isfinite().all() or (sums[:, [0, *range(2, sums.shape[1])]] < 0).any():
+            raise ValueError("sums of steps and costs must be finite and not below 0.")
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
         """Add the next batch of consecutive steps, [N, T], or [T] of a single environment."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from shlex import quote
 from typing import Any
 
 import gymnasium
@@ -150,7 +151,7 @@ def _check_id(family: ForeignFamily, name: str) -> None:
     if family is not FOREIGN["torchrl"] and module:  # Gymnasium would import it
         raise ConfigError(
             f"env.id={name}: a configuration cannot import a module. If you trust '{module}', use "
-            f"import={module} env.id={plain}"
+            f"{quote(f'import={module}')} {quote(f'env.id={plain}')}"
         )
     if family is FOREIGN["torchrl"] and "." not in name and name not in TORCHRL_CLASSES:
         raise ConfigError(

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.envs import ConfigError, ConstrainedEnv, make_env
 from safe_rl.envs.safety_gym.robots import copy_robot, fingerprint, is_robot, own_robot
-from safe_rl.files import check_no_links, read_json, replace_json
+from safe_rl.files import check_no_links, printable, read_json, replace_json
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import CheckpointStore, check_interface
 from safe_rl.runs.run import Run
@@ -63,7 +63,8 @@ def keep_robot(run: Run, env: Mapping[str, Any]) -> None:
         note["file"] = str(copy_robot(robot, run.robot_folder).relative_to(run.robot_folder))
     except ConfigError as error:
         shutil.rmtree(run.robot_folder, ignore_errors=True)
-        print(f"{error} The run keeps no copy of its robot: it needs that file as it is now.")
+        reason = printable(str(error))
+        print(f"{reason} The run keeps no copy of its robot: it needs that file as it is now.")
     replace_json(run.robot_file, note)
 
 

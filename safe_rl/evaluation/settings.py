@@ -11,7 +11,7 @@ from annotated_types import Interval
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from safe_rl.checks import Fraction, Share, check_value, rule
+from safe_rl.checks import Fraction, SettingError, Share, check_value, rule
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 
@@ -156,6 +156,8 @@ def certificate_options(
             raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
         kind = get_type_hints(CertificateOptions, include_extras=True)[name]
         options[name] = check_value(f"certificate.{name}", kind, value)
+    if changes and changes.get("episodes") == 0:
+        raise SettingError("certificate.episodes=0: a test needs episodes.")
     if not options["episodes"]:  # training was to end without a certificate
         options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     # with risk=mean the section may still have numbers, such as the tail of WCSAC's critics

@@ -61,6 +61,8 @@ def read_variations(given: Any) -> list[Variation]:
         9
     """
     found: list[Variation] = []
+    if given == []:
+        raise ValueError("variations=[]: it must name at least one set, file or row.")
     for part in given if isinstance(given, list) else [given]:
         is_set = isinstance(part, str) and not part.endswith((".yaml", ".yml"))
         rows = _set_of(part) if is_set else part
@@ -69,7 +71,7 @@ def read_variations(given: Any) -> list[Variation]:
                 rows = read_yaml(Path(part).expanduser())
             except (OSError, ValueError) as error:
                 raise ValueError(f"variations={part}: {error}") from error
-        if not isinstance(rows, Mapping):
+        if not isinstance(rows, Mapping) or not rows:
             raise ValueError(f"variations={part}: it must have rows, as conf/variations.yaml has.")
         found += [
             v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])

@@ -20,7 +20,7 @@ from torchrl.checkpoint import CheckpointError
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
 from safe_rl.collectors import match_columns
-from safe_rl.files import load_tensors, save_tensors
+from safe_rl.files import all_printable, load_tensors, printable, save_tensors
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
 
 
@@ -82,7 +82,8 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
         content = load_tensors(path, lazy=lazy)
         if not all(isinstance(content[name], dict) for name in ("facts", "parts")):
             raise ValueError("it has no facts, or no parts")
-    except (ValueError, KeyError, TypeError) as error:
+        content["facts"] = all_printable(content["facts"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(f"Cannot use the checkpoint {path}: {error}.") from error
     return content
 
@@ -318,7 +319,7 @@ class CheckpointStore:
             try:
                 components[name].load_state_dict(states[name])
             except Exception as error:  # a part of unknown origin can be wrong in any way
-                words = " ".join(str(error).split())
+                words = printable(" ".join(str(error).split()))
                 raise CheckpointError(
                     f"Cannot use the checkpoint {path}: its {name!r} does not fit: {words}"
                 ) from error

@@ -17,7 +17,7 @@ from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
-from safe_rl.checks import Text
+from safe_rl.checks import Text, checked
 from safe_rl.extras import import_extra, needs_extra
 from safe_rl.files import read_text, replace_text
 from safe_rl.runs.run import Run
@@ -36,6 +36,7 @@ class ResumableLogger:
         """Write what is buffered and end the logger's run."""
 
 
+@checked
 class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
     """Event files for TensorBoard.
 
@@ -75,6 +76,7 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
 
 
 @needs_extra("mlflow", "mlflow")
+@checked
 class MLflowLogger(MLFlowLogger, ResumableLogger):
     """A run of an MLflow experiment; a continued run uses the same MLflow run.
 
@@ -111,6 +113,7 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
 
 
 @needs_extra("wandb", "wandb")
+@checked
 class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     """A run of Weights & Biases; a continued run uses the same W&B run.
 

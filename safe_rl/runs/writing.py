@@ -14,6 +14,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from safe_rl.checks import SettingError
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import lock_folder
@@ -66,6 +67,7 @@ class RunWriter:
         Raises:
             FileExistsError: If the folder of a new run already holds one.
             RunInUseError: If another process writes into the folder.
+            SettingError: If the logger cannot be made of its settings.
             ValueError: If the table lacks epochs of the continued run.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -78,11 +80,13 @@ class RunWriter:
             # written before the table: a run without a configuration cannot be continued
             if epoch is None or not self.run.is_run:
                 self._save_config()
-            table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
-            self._table = opened.enter_context(table)
-            self._logger = instantiate(self._config.get("logger"), log_dir=str(self.directory))
+            # before the table: a run that has none yet leaves no folder if its logger fails
+            self._logger = self._make_logger()
             if self._logger is not None:
                 opened.callback(self._logger.close)
+            table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
+            self._table = opened.enter_context(table)
+            if self._logger is not None:
                 if epoch is not None:
                     self._logger.continue_from(steps)
                 if not epoch:
@@ -97,6 +101,21 @@ class RunWriter:
             yield
             self._save_config()
             self._log_final()
+
+    def _make_logger(self) -> Any:
+        try:
+            logger = instantiate(self._config.get("logger"), log_dir=str(self.directory))
+        except (SettingError, OSError):
+            raise
+        except Exception as error:  # those of the services have types of their own
+            raise SettingError(f"logger: {' '.join(str(error).split())}") from error
+        for name in ("log_scalar", "continue_from", "log_hparams", "close"):
+            if logger is not None and not callable(getattr(logger, name, None)):
+                raise SettingError(
+                    f"logger._target_={self._config.logger._target_}: it has no '{name}'. Derive a "
+                    "logger of yours from safe_rl.runs.loggers.ResumableLogger."
+                )
+        return logger
 
     def _save_config(self) -> None:
         if not self._is_config_saved:

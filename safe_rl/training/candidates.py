@@ -80,6 +80,20 @@ class Candidates(Resumable):
         self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
         self.waiting: list[dict[str, Any]] = []
 
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the waiting policies.
+
+        Raises:
+            ValueError: If one lacks its steps, its epoch or its states.
+        """
+        super().load_state_dict(state_dict)
+        kinds = {"steps": int, "epoch": int, "states": dict}
+        for policy in self.waiting:
+            if not isinstance(policy, dict) or {k: type(v) for k, v in policy.items()} != kinds:
+                raise ValueError(
+                    "a waiting policy must have whole 'steps' and 'epoch', and 'states'."
+                )
+
     def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
         """Add the epochs of a run that is resumed."""
         for row in rows:

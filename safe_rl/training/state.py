@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import threading
@@ -29,6 +30,12 @@ class Progress(Resumable):
         self.epoch = 0
         self.steps = 0
         self.seconds = 0.0
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the counters; ValueError unless they are numbers from 0 on."""
+        super().load_state_dict(state_dict)
+        if not all(0 <= n < math.inf for n in (self.epoch, self.steps, self.seconds)):
+            raise ValueError("its counters must be finite and not below 0.")
 
     def add(self, steps: int, seconds: float) -> None:
         """Count one epoch."""

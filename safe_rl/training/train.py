@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from shlex import quote
 from signal import SIGINT, Signals
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
@@ -46,7 +48,7 @@ SETTING_ERRORS: tuple[type[Exception], ...] = (
 )
 _WHILE_TRAINING = (
     *(OSError, TableError, ConfigError, ContractError, EpisodeError, FloatingPointError),
-    *(SettingError, WorkerError),
+    *(SettingError, WorkerError, MemoryError),
 )
 _UNEXPECTED = "This happened during training, not because of a setting."
 
@@ -90,7 +92,7 @@ def train(
     run, say = Run(directory), _print if program else _ignore
     hydra = _complete(config, run)
     again = _command_again(run, config, program)
-    with _removed_unless_begun(run), lock_folder(run.lock_file):
+    with _named_memory(config), _removed_unless_begun(run), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has its {config.frames:,} frames already"
             print(f"{done}: raise 'frames' to train on.")
@@ -214,6 +216,22 @@ def _removed_unless_begun(run: Run) -> Iterator[None]:
         if is_new and not run.has_begun:
             shutil.rmtree(run.directory, ignore_errors=True)
         raise
+
+
+@contextmanager
+def _named_memory(config: DictConfig) -> Iterator[None]:
+    """Name the settings that need memory, where there is not enough of it."""
+    try:
+        yield
+    except Exception as error:
+        # torch raises a RuntimeError for main memory
+        is_short = isinstance(error, MemoryError | torch.OutOfMemoryError)
+        if not (is_short or re.search("allocat.* memory", str(error))):
+            raise
+        raise MemoryError(
+            f"There is not enough memory with frames_per_batch={config.frames_per_batch}, "
+            f"num_envs={config.num_envs} and these networks: lower them."
+        ) from error
 
 
 @contextmanager

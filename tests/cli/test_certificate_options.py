@@ -55,3 +55,5 @@ def test_options_are_replaced_and_wrong_ones_named():
         certificate_options(config, {"episode": 10})
     with pytest.raises(ValueError, match="it must be"):
         certificate_options(config, {"level": 1.5})
+    with pytest.raises(ValueError, match="episodes=0: a test needs episodes"):
+        certificate_options(config, {"episodes": 0})

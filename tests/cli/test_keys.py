@@ -184,3 +184,8 @@ def test_environments_refuse_in_a_line(key):
             assert key in words
         else:
             assert not isinstance(value, int | float) or abs(value) <= 1e9
+
+
+def test_an_algorithm_that_compiles_nothing_says_so():
+    with pytest.warns(UserWarning, match="compile has no effect: algo=sac"):
+        check_settings(compose_config("algo=sac", "compile=true"))

@@ -45,6 +45,11 @@ def test_configurations_are_shown(command):
         (["hydra.run.dir=/proc/runs"], "/proc/runs"),
         (["init_from=nowhere"], "init_from=nowhere: there is no such folder or file."),
         (["frames=-5"], "frames=-5: it must be"),
+        (["hydra.run.dir="], "hydra.run.dir= is empty"),
+        (["-m", "hydra.sweep.dir="], "hydra.sweep.dir= is empty"),
+        (["transforms=[saute,saute]"], "a transform is there twice"),
+        (["logger.exp_name=3"], "logger.exp_name=3: it must be a valid string"),
+        (["logger._target_=torch.optim.Adam"], "logger.exp_name: Adam has no such argument"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line_and_leaves_nothing(command, overrides, words):
@@ -150,10 +155,26 @@ def test_a_backend_that_matplotlib_does_not_know_is_said_before_the_run_begins(t
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("kind", [ConfigError, FloatingPointError])
-def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypatch, kind):
+def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):
+    monkeypatch.setattr("safe_rl.training.building.os.sysconf", lambda name: 100)
+    status, *_ = command(*SMALL, "frames=40")
+    assert status == "frames_per_batch=40: a batch takes 0 GB, and there are 0 GB."
+    assert list(Path.cwd().rglob("*.csv")) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ConfigError("the cost is not finite"), "the cost is not finite"),
+        (FloatingPointError("the cost is not finite"), "the cost is not finite"),
+        (MemoryError(), "not enough memory with frames_per_batch=40, num_envs=2"),
+        (RuntimeError("alloc_cpu.cpp:127] can't allocate memory:\nyou"), "not enough memory with"),
+    ],
+)
+def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypatch, error, words):
     def fail(trainer, batches):
-        raise kind("the cost is not finite")
+        raise error
 
     monkeypatch.setattr(Trainer, "epoch", fail)
-    assert command(*SMALL, "frames=40")[0].splitlines() == ["the cost is not finite"]
+    (line,) = command(*SMALL, "frames=40")[0].splitlines()
+    assert words in line

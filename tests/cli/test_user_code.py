@@ -11,7 +11,7 @@ from safe_rl import trust
 from safe_rl.cli import user_code
 from safe_rl.cli.resuming import read_resumed
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
-from safe_rl.envs import make_env
+from safe_rl.envs import complete_env, make_env
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
 from safe_rl.training.building import build_trainer
@@ -82,6 +82,9 @@ def test_errors_are_one_line(folder, module, message):
     assert "\n" not in str(error.value)
 
 
+GYMNASIUM = "safe_rl.envs.gymnasium.make_gymnasium"
+
+
 def begun_run(directory, **changes):
     """Folder of a run of somebody else's, with a configuration of theirs."""
     with RunWriter(Run(directory), point_mass_config(), {"cost": 25.0}, 20).writing():
@@ -103,6 +106,20 @@ def test_opening_a_run_imports_nothing(folder):
     assert not (folder / "users_own.trace").exists()
     for given in ([], ["users_own"], ["moved_since.py"], ["/home/o'brien/moved.py"]):
         check_imports(config, given, folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "act"),
+    [
+        ({"import": ["$(id)"]}, lambda run: read_resumed(run, None, [])),
+        ({}, lambda run: trust.locate("$(id).Loss")),
+        ({}, lambda run: complete_env({"_target_": GYMNASIUM, "id": "$(id):Walk-v0"})),
+    ],
+)
+def test_what_is_to_be_copied_into_a_shell_is_quoted(changes, act, folder):
+    begun_run(folder / "run", **changes)
+    with pytest.raises(ValueError, match=r"'import=\$\(id\)'"):
+        act(folder / "run")
 
 
 def exec_node(trace):

@@ -22,6 +22,8 @@ from safe_rl.evaluation.variations import Variation, varied
         (["variations=sensing", "record=true"], "cannot be combined with video=true"),
         (["variations=dynamic"], "Did you mean 'dynamics'"),
         (["variations=nowhere.yaml"], "No such file or directory: 'nowhere.yaml'"),
+        (["variations={}"], "it must have rows"),
+        (["variations=[]"], "it must name at least one"),
         (["variations={heavy: 2}"], "'heavy: 2' must have keys of the environment"),
         (["variations={heavy: {algo.name: cpo}}"], "must have keys of the environment"),
         (["variations={noise: {transforms.sensor_noise: 2}}"], "must have keys of the environment"),

@@ -6,6 +6,7 @@ import pytest
 from point_mass import PointMass
 from run_configs import point_mass_config
 
+from safe_rl.checks import SettingError
 from safe_rl.runs.loggers import ResumableLogger, WandbLogger
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
@@ -46,7 +47,7 @@ def test_mlflow_holds_the_table_and_continues_the_same_run(tmp_path):
 def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install -e '\.\[wandb\]'"):
-        WandbLogger(exp_name="", project="p", offline=True, log_dir=str(tmp_path))
+        WandbLogger(exp_name="mine", project="p", offline=True, log_dir=str(tmp_path))
 
 
 class Scalars(ResumableLogger):
@@ -67,3 +68,25 @@ def test_a_logger_of_ones_own_needs_only_to_log(tmp_path):
     train(tmp_path, own, "frames=160")
     train(tmp_path, own, "frames=320")
     assert sorted(set(Scalars.steps)) == [160, 320]
+
+
+class Mute:
+    """What logs nothing."""
+
+    def __init__(self, log_dir):
+        pass
+
+
+class Refused(Mute):
+    def __init__(self, log_dir):
+        raise Exception("unknown\nuri")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("Mute", "it has no 'log_scalar'"), ("Refused", "^logger: unknown uri$")]
+)
+def test_a_logger_that_cannot_log_is_refused_before_the_run_begins(name, words, tmp_path):
+    allow(__name__)
+    with pytest.raises(SettingError, match=words):
+        train(tmp_path / "run", f"logger._target_={__name__}.{name}", "frames=160")
+    assert not (tmp_path / "run" / "progress.csv").exists()
