@@ -25,6 +25,9 @@ _PACKAGED = Path(__file__).parent / "conf"
 CONF = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[1] / "conf"
 """Folder of ``config.yaml`` and the groups: of a checkout, or the copy in an installed package."""
 
+PROGRAM = "safe-rl train" if CONF == _PACKAGED else "python train.py"
+"""The command that trains: of an installed package, or in the folder of a checkout."""
+
 # Largest size of a configuration or notes [bytes]; those of a run have about ten thousand.
 _MOST_BYTES = 1_000_000
 # Largest depth of a configuration; a run's is six. The C parser overflows the stack at about ten

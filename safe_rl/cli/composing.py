@@ -29,7 +29,7 @@ from safe_rl.cli.config import General, keys_of, unknown_key
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
-from safe_rl.files import CONF
+from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean
 
 _MOST_LISTED = 40
@@ -192,7 +192,7 @@ def _unknown_choice(error: MissingConfigException) -> str:
     file = re.match(r"In '(?!config)([^']+)'", str(error))
     place = f"{file[1]}.yaml: " if file else ""
     all_of_them = f"There are {', '.join(known)}"
-    listed = all_of_them if len(known) <= _MOST_LISTED else "'python train.py --help' names all"
+    listed = all_of_them if len(known) <= _MOST_LISTED else f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     hint = hint or did_you_mean(name, known, 0.6)
     more = f" {listed}; a file of yours needs --config-dir FOLDER."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shlex
 import shutil
 import warnings
 from collections.abc import Mapping, Sequence
@@ -26,6 +25,7 @@ from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
 from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
+from safe_rl.runs.command import config_dirs, repeating
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
 
@@ -89,9 +89,12 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         shutil.copytree(source.robot_folder, target.robot_folder, symlinks=True)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
-    words = read_yaml(source.overrides_file) if source.overrides_file.is_file() else []
+    overrides, hydra = (
+        read_yaml(file) if file.is_file() else None
+        for file in (source.overrides_file, source.hydra_file)
+    )
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
-    about |= {"steps": steps, "command": shlex.join(["python", "train.py", *words])}
+    about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra))}
     if source.code:
         about["commit"] = source.code[-1]["commit"]
     replace_json(folder / "policy.json", about)

@@ -10,8 +10,6 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import os
-import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
+from safe_rl.runs.command import config_dirs, repeating, select
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import differences, role_of
 from safe_rl.runs.table import read_table
@@ -105,13 +104,9 @@ class Run(folders.Run):
         """The command that repeats it, or None if its overrides are not recorded."""
         if self.overrides is None:
             return None
-        words = [f"--config-dir={clean(path)}" for path in self.notes.get("config_dirs", ())]
-        if isinstance(self.notes.get("frames_before"), int):  # it was continued for longer
-            words += [word for word in self.overrides if not word.startswith("frames=")]
-            words += [f"frames={self.settings['frames']}"]
-        else:
-            words += self.overrides
-        return shlex.join(["python", "train.py", *words])
+        is_continued = isinstance(self.notes.get("frames_before"), int)
+        frames = self.settings["frames"] if is_continued else None
+        return repeating(self.overrides, map(clean, self.notes.get("config_dirs", ())), frames)
 
     @cached_property
     def evaluation_records(self) -> list[dict[str, Any]]:
@@ -127,13 +122,6 @@ class Run(folders.Run):
     def code_text(self) -> str | None:
         """The version and commit of its code, see `read_code`, or None."""
         return read_code(self.notes["code"]) if "code" in self.notes else None
-
-
-def select(node: Any, *keys: str) -> Any:
-    """The value at a path of keys in nested mappings, or None."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
@@ -201,15 +189,10 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
     if not folder.table_file.exists():
         raise ValueError("it has not begun: no progress.csv")
     table = read_table(folder.table_file)
-    runtime = select(read(folder.hydra_file), "hydra", "runtime")
-    start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
-    # folders of --config-dir, and of config_dir in Python
-    directories = [s["path"] for s in sources if s["provider"].endswith("command-line")]
     before = select(read(folder.composed_file), "frames")
     notes = {
         "overrides": read(folder.overrides_file),
-        # relative to the folder where the run was started, as a user would type them
-        "config_dirs": [os.path.relpath(p, start) if start else p for p in directories] or None,
+        "config_dirs": config_dirs(read(folder.hydra_file)) or None,
         "frames_before": before if before != settings.get("frames") else None,
         "certificate": read(folder.certificate_file, read_certificate),
         "code": read(folder.code_file, read_code),

@@ -30,7 +30,7 @@ from safe_rl.evaluation import Certificate, certify
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import keep_robot, maker_of, robot_of, transforms_of
 from safe_rl.evaluation.settings import certificate_options
-from safe_rl.files import replacing
+from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError, checkpoint_steps, lock_folder
 from safe_rl.runs.identity import check_same_run
@@ -65,7 +65,7 @@ def train(
     *,
     continues: bool = False,
     callbacks: Sequence[Callback] = (),
-    program: str | None = "python train.py",
+    program: str | None = PROGRAM,
 ) -> Run:
     """Train, or continue to train; at the end, certify a run that is to keep limits.
 

@@ -53,12 +53,19 @@ def test_a_policy_of_the_package_is_loaded_and_evaluated_as_a_run(run, package, 
 
 def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
     (run / ".hydra").mkdir()
-    (run / ".hydra/overrides.yaml").write_text("- model.hidden_sizes=[16, 16]\n- '+note=it''s'\n")
+    (run / ".hydra/overrides.yaml").write_text(
+        "- model.hidden_sizes=[16, 16]\n- '+note=it''s'\n- import=['my_gym.py']\n"
+    )
+    sources = [{"path": "/home/me/conf", "provider": "command-line"}]
+    runtime = {"cwd": "/home/me", "config_sources": sources}
+    (run / ".hydra/hydra.yaml").write_text(json.dumps({"hydra": {"runtime": runtime}}))
     assert export([str(run), str(tmp_path / "packed")]) == 0
     about = json.loads((tmp_path / "packed" / "policy.json").read_text())
     expected = {"environment": "PointGoal1", "algorithm": "ppo_lagrangian", "steps": 320}
     assert about.items() >= expected.items()
-    assert shlex.split(about["command"])[2:] == ["model.hidden_sizes=[16, 16]", "+note=it's"]
+    # as it was typed; Hydra notes a list of imports
+    expected = ["--config-dir=conf", "model.hidden_sizes=[16, 16]", "+note=it's"]
+    assert shlex.split(about["command"])[2:] == [*expected, "import=my_gym.py"]
     whole = sum(path.stat().st_size for path in (run / "checkpoints/last").iterdir())
     packed = sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*.torchrl"))
     assert packed < whole / 2
