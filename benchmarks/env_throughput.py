@@ -25,9 +25,9 @@ import torch
 from omegaconf import OmegaConf
 
 from safe_rl.envs import SUITE, SafetyGymEnv
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics
 from safe_rl.envs.safety_gym.building import build_scene
-from safe_rl.envs.safety_gym.state import gremlin_path
+from safe_rl.envs.safety_gym.episodes import gremlin_path
 from safe_rl.envs.safety_gym.suite import resolve
 
 COLUMNS = ("env", "num_envs", "threads", "env steps/s", "bare steps/s", "ratio", "reset ms", "MB")

@@ -20,7 +20,7 @@ import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of t
 import gymnasium
 import torch
 
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 from safe_rl.envs.velocity.velocity_config import RUNNERS
 

@@ -35,6 +35,7 @@ _ROOMS: dict[str, tuple[str, ...] | None] = {
     "safe_rl.objectives": None,
     "safe_rl.runs.loggers": ("MLflowLogger", "TensorboardLogger", "WandbLogger"),
     "torch.optim": None,
+    "torchrl.envs.transforms": ("RewardScaling",),
 }
 
 

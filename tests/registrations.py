@@ -20,7 +20,7 @@ from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import ROBOTS, registered_keys, set_registered_keys
 from safe_rl.envs.safety_gym.costs import COSTS
 from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
-from safe_rl.envs.safety_gym.readings import READINGS
+from safe_rl.envs.safety_gym.observations import READINGS
 from safe_rl.envs.safety_gym.tasks import TASKS
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)

@@ -6,14 +6,15 @@ Names and keys are imported at once. Modules that build environments are importe
 import os
 from typing import TYPE_CHECKING
 
-from safe_rl.envs.errors import ConfigError
 from safe_rl.envs.families import (
     complete_env,
     env_names,
     env_node,
+    make_env,
     store_config,
     store_configs,
 )
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.extras import import_later
@@ -21,7 +22,6 @@ from safe_rl.extras import import_later
 if TYPE_CHECKING:
     from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
     from safe_rl.envs.gymnasium.conversion import from_gymnasium, from_six_values
-    from safe_rl.envs.making import make_env
     from safe_rl.envs.pictures import OpenGLError
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
@@ -54,7 +54,6 @@ __getattr__, __dir__ = import_later(
     {
         "contract": ["ConstrainedEnv", "ContractError", "check_constrained_env"],
         "gymnasium.conversion": ["from_gymnasium", "from_six_values"],
-        "making": ["make_env"],
         "pictures": ["OpenGLError"],
         "safety_gym.env": ["SafetyGymEnv"],
         "safety_gym.layouts": ["LayoutError"],

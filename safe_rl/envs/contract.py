@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.envs.costs import COST
+from safe_rl.envs.keys import COST
 from safe_rl.naming import key_name
 
 

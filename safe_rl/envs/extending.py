@@ -8,14 +8,12 @@ cell can run twice. Environments that exist already do not change.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.keys import Key
+from safe_rl.envs.keys import ConfigError, Key
 from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import ROBOTS, infer_key, registered_keys, set_registered_keys
 from safe_rl.envs.safety_gym.config_keys import Locations, Objects, Placements
@@ -26,12 +24,13 @@ from safe_rl.envs.safety_gym.elements import (
     CYLINDER,
     ELEMENTS,
     PLACEMENT_ORDER,
+    PUSHED,
     SPHERE,
     Element,
     Geom,
     Motion,
 )
-from safe_rl.envs.safety_gym.readings import READINGS, Reading
+from safe_rl.envs.safety_gym.observations import READINGS, Reading
 from safe_rl.envs.safety_gym.robots import load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
 from safe_rl.envs.safety_gym.world import World
@@ -100,12 +99,10 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
         0.1
     """
     _refuse_taken("element", element.kind)
-    _require_functions(height=element.height, geoms=element.geoms)
-    _require_member("motion", element.motion, Motion)
     others = [row for row in ELEMENTS if row.kind != element.kind]
     if element.label in {"robot", "floor", *(row.label for row in others)}:
         raise ConfigError(f"Another object is called '{element.label}': choose another label.")
-    if element.singular and f"{element.kind}_num" in (keys or {}):
+    if element.label == element.kind and f"{element.kind}_num" in (keys or {}):
         raise ConfigError(
             f"There is only one object if 'label' and 'kind' are both '{element.kind}': give "
             f"another label, or remove '{element.kind}_num'."
@@ -136,13 +133,9 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         >>> register_task("away", away, keys={"reward_away": 0.5})
     """
     _refuse_taken("task", name)
-    has_goals = {} if task.met is None else {"met": task.met}
-    _require_functions(reward=task.reward, measure=task.measure, **has_goals)
-    if task.next_goal is not None:
-        _require_member("next_goal", task.next_goal, NextGoal)
     for kinds in (task.elements, task.touches, task.at_origin):
         _refuse_unknown_kinds(kinds)
-    for kind in (kind for kind in task.elements if not BY_KIND[kind].singular):
+    for kind in (kind for kind in task.elements if BY_KIND[kind].label != kind):
         raise ConfigError(f"Task '{name}' cannot add '{kind}': set the key '{kind}_num' instead.")
     if (task.met or task.next_goal) and "goal" not in task.elements:
         raise ConfigError(f"Task '{name}' meets or draws goals: add 'goal' to its elements.")
@@ -170,7 +163,6 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
         >>> register_cost(speeding, keys={"constrain_speed": False, "speed_limit": 1.0})
     """
     _refuse_taken("cost", cost.key)
-    _require_functions(magnitude=cost.magnitude)
     if not cost.key.startswith("cost_"):
         raise ConfigError(f"The cost key '{cost.key}' must start with 'cost_'.")
     _refuse_unknown_kinds(cost.touches)
@@ -199,7 +191,6 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
         >>> register_observation(height, keys={"observe_height": False})
     """
     _refuse_taken("observation", reading.name)
-    _require_functions(size=reading.size, read=reading.read)
     _refuse_unknown_kinds(reading.touches)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
@@ -213,7 +204,7 @@ def register_robot(name: str, path: str | Path) -> None:
         ConfigError: If the name is taken, or the file lacks what `robots` asks for.
     """
     _refuse_taken("robot", name)
-    load_robot(str(path))
+    load_robot(Path(path))
     ROBOTS[name] = Path(path)
     forget_scenes()
 
@@ -221,18 +212,6 @@ def register_robot(name: str, path: str | Path) -> None:
 def _refuse_taken(what: str, name: str) -> None:
     if name in _BUILT_IN[what]:
         raise ConfigError(f"'{name}' is a built-in {what}: choose another name.")
-
-
-def _require_functions(**given: Any) -> None:
-    for name, value in given.items():
-        if not callable(value):
-            raise ConfigError(f"'{name}' must be a function, such as a lambda, got {value!r}.")
-
-
-def _require_member(name: str, value: Any, kind: type[Enum]) -> None:
-    if not isinstance(value, kind):
-        members = " or ".join(map(str, kind))
-        raise ConfigError(f"'{name}' must be {members}, got {value!r}.")
 
 
 def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
@@ -251,9 +230,9 @@ def _keys_of(element: Element) -> dict[str, Key]:
         "keepout": Key(0.4, NonNegativeFloat),
         "size": Key(0.1, PositiveFloat),
     }
-    if not element.singular:
+    if element.label != element.kind:
         keys["num"] = Key(0, Objects)
-    if element.is_free:
+    if element.motion in PUSHED:
         keys |= {"density": Key(0.001, PositiveFloat), "rots": Key((), tuple[float, ...])}
     if element.motion is Motion.GUIDED:
         keys["travel"] = Key(0.3, NonNegativeFloat)

@@ -1,27 +1,35 @@
-"""Names and keys of all environments, for Hydra, for Gymnasium and for `make_env`.
+"""Names and keys of all environments, for Hydra and Gymnasium, and `make_env`.
 
 The key `_target_` of a node names its family: a function or class that is called with a mapping of
 the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without it
 belongs to Safety Gym. Modules that build environments are not imported here, for a quick start.
 
-A configuration may come from an unknown source. So an `id` is refused if it makes a library import
-a module, or names a class that is not listed here. The user permits such a module by `import=`.
+A configuration may come from an unknown source. So an `id` cannot make a library import a module:
+the user permits it by `import=`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from inspect import signature
 from shlex import quote
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from hydra.core.config_store import ConfigStore
 
-from safe_rl.envs.costs import parse_ranges
-from safe_rl.envs.errors import ConfigError, on_cpu_only
-from safe_rl.envs.keys import Count, Key, Text, checked, structured
+from safe_rl.checks import Text
+from safe_rl.envs.keys import (
+    ConfigError,
+    Count,
+    Key,
+    checked,
+    on_cpu_only,
+    parse_ranges,
+    structured,
+)
 from safe_rl.envs.safety_gym.config import KEYS, SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import (
@@ -31,35 +39,32 @@ from safe_rl.envs.velocity.velocity_config import (
     resolve_velocity,
 )
 from safe_rl.naming import did_you_mean
-from safe_rl.trust import allow
+from safe_rl.trust import allow, locate
 
-GROUP = "env"
-"""The group of environments in Hydra."""
+if TYPE_CHECKING:
+    import torch
+
+    from safe_rl.envs.contract import ConstrainedEnv
+
+GROUP = "env"  # the group of environments in Hydra
 VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
-SAFETY_GYM = "safety_gym"
-"""The environment with the default of every key of Safety Gym, from which others inherit."""
-
-# These classes use another package by default; MuJoCo's own library is installed.
-_MUJOCO = {"backend": "mujoco", "parallel": False}
-TORCHRL_CLASSES: dict[str, Mapping[str, Any]] = {
-    "PendulumEnv": {},
-    "FinancialRegimeEnv": {},
-    **dict.fromkeys(("AntEnv", "HopperEnv", "HumanoidEnv", "Walker2dEnv"), _MUJOCO),
-}
-"""Classes of `torchrl.envs` that need no `import=`, and their default arguments."""
+SAFETY_GYM = "safety_gym"  # the default of every key of Safety Gym, from which others inherit
 
 _RANGES = (
     "costs of leaving a range: cost_<kind> -> [column of the observation, lowest, highest], of "
     "another entry [entry, column, lowest, highest]"
 )
-_COSTS = Key(
-    None, tuple[Text, ...] | None, "names of the costs; null: `cost` and all `cost_<kind>`"
-)
-_STEPS = Key(None, Count | None, "steps after which an episode is truncated; null: its own number")
-_ARGUMENTS = Key(None, dict[str, Any] | None, "arguments of its constructor: {g: 9.81}")
 _HIDDEN = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
 _MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
-_COMMON = {"cost_keys": _COSTS, "num_steps": _STEPS, "kwargs": _ARGUMENTS}
+_COMMON = {
+    "cost_keys": Key(
+        None, tuple[Text, ...] | None, "names of the costs; null: `cost` and all `cost_<kind>`"
+    ),
+    "num_steps": Key(
+        None, Count | None, "steps after which an episode is truncated; null: its own number"
+    ),
+    "kwargs": Key(None, dict[str, Any] | None, "arguments of its constructor: {g: 9.81}"),
+}
 
 
 @dataclass(frozen=True)
@@ -68,22 +73,20 @@ class ForeignFamily:
 
     Attributes:
         target: `_target_` of its nodes.
-        title: Name of one of its environments in messages.
         keys: Its keys. `id` and `name`, which all families have, are not listed.
         describe: "module:function" that returns the cost keys and the length of episodes of a node.
             If one of them is None, it makes an environment to find out.
     """
 
     target: str
-    title: str
     keys: Mapping[str, Key]
     describe: str
 
 
+# Name in the group `env` -> family of another library.
 FOREIGN = {
     "gymnasium": ForeignFamily(
         "safe_rl.envs.gymnasium.make_gymnasium",
-        "A Gymnasium environment",
         {
             **_COMMON,
             "privileged": _HIDDEN,
@@ -95,13 +98,11 @@ FOREIGN = {
     ),
     "safety_gymnasium": ForeignFamily(
         "safe_rl.envs.gymnasium.make_safety_gymnasium",
-        "An environment of Safety-Gymnasium",
         {**_COMMON, "render_mode": _MODE},
         "safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
     ),
     "torchrl": ForeignFamily(
         "safe_rl.envs.torchrl.make_torchrl",
-        "An environment of TorchRL",
         {
             **_COMMON,
             "observe": Key(None, tuple[Text, ...] | None, "entries; null: `observation` or all"),
@@ -111,10 +112,9 @@ FOREIGN = {
             "cost": Key(None, Any, "a function from a step to its cost: my_module:function, or "
                         "{_target_: my_module.function, limit: 4}"),
         },
-        "safe_rl.envs.torchrl.torchrl_env:describe_node",
+        "safe_rl.envs.torchrl:describe_node",
     ),
 }  # fmt: skip
-"""Name in the group `env` -> family of another library."""
 
 
 def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
@@ -130,36 +130,24 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
             meant = did_you_mean(str(key), [*family.keys, "id"])
             others = " The environment's own arguments belong in 'kwargs': env.kwargs='{…}'."
             raise ConfigError(
-                f"{family.title} has no key '{key}'.{on_cpu_only(key) or meant + others}"
+                f"This environment has no key '{key}'.{on_cpu_only(key) or meant + others}"
             )
     if not isinstance(node.get("id"), str):
         raise ConfigError("Which environment? Name it: env.id=…")
+    module, _, plain = node["id"].rpartition(":")
+    if module and family is not FOREIGN["torchrl"]:  # Gymnasium would import it
+        raise ConfigError(
+            f"env.id={node['id']}: a configuration cannot import a module. If you trust "
+            f"'{module}', use {quote(f'import={module}')} {quote(f'env.id={plain}')}"
+        )
     full = {"name": node["id"], **node}
     for key, row in family.keys.items():
         checked(key, row.annotation, full.setdefault(key, row.default))
-    _check_id(family, node["id"])
     parse_ranges(full.get("outside"))
     if None in (full["cost_keys"], full["num_steps"]):
-        # Imported here, because environments need torch and their names do not.
         module, _, function = family.describe.partition(":")
         full["cost_keys"], full["num_steps"] = getattr(import_module(module), function)(full)
     return full
-
-
-def _check_id(family: ForeignFamily, name: str) -> None:
-    module, _, plain = name.rpartition(":")
-    if family is not FOREIGN["torchrl"] and module:  # Gymnasium would import it
-        raise ConfigError(
-            f"env.id={name}: a configuration cannot import a module. If you trust '{module}', use "
-            f"{quote(f'import={module}')} {quote(f'env.id={plain}')}"
-        )
-    if family is FOREIGN["torchrl"] and "." not in name and name not in TORCHRL_CLASSES:
-        raise ConfigError(
-            f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
-            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class of TorchRL use "
-            "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
-            "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
-        )
 
 
 def hint_of_gymnasium(name: str) -> str:
@@ -170,8 +158,7 @@ def hint_of_gymnasium(name: str) -> str:
     return f" It is one of Gymnasium's: env=gymnasium env.id={name}."
 
 
-_STORED: dict[str, dict[str, Any]] = {}
-"""The nodes of `store_config` by name."""
+_STORED: dict[str, dict[str, Any]] = {}  # the nodes of `store_config` by name
 
 
 def env_names() -> list[str]:
@@ -223,11 +210,11 @@ def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
         if target == family.target:
             return complete_foreign(family, node)
     keys = {key: value for key, value in node.items() if key not in ("name", "_target_")}
-    resolvers: dict[Any, Callable[..., Any]] = {None: resolve, VELOCITY_TARGET: resolve_velocity}
-    if target not in resolvers:
+    if target == VELOCITY_TARGET:
+        return {**env_node(resolve_velocity(keys)), **node}
+    if target is not None:
         return dict(node)
-    config = resolvers[target](keys)
-    is_complete = target is None and KEYS.keys() <= node.keys()
+    config, is_complete = resolve(keys), KEYS.keys() <= node.keys()
     return dict(node) if is_complete else {**env_node(config), **node}
 
 
@@ -273,7 +260,7 @@ def store_configs(whole: Container[str] | None = None) -> None:
     nodes: dict[str, Any] = {}
     for name, keys in (SUITE | EXTRAS | _STORED).items():
         base = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
-        nodes[name] = {**base, "name": name, **_lists(keys)}
+        nodes[name] = {**base, "name": name, **keys}
     for name, row in VELOCITY_SUITE.items():
         values = {"_target_": VELOCITY_TARGET, "name": name, **row}
         keys = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
@@ -286,6 +273,75 @@ def store_configs(whole: Container[str] | None = None) -> None:
         nodes = {name: node if name in whole else {} for name, node in nodes.items()}
     for name, node in {SAFETY_GYM: structured("SafetyGym", text | KEYS), **nodes}.items():
         ConfigStore.instance().store(name, node, GROUP)
+
+
+def make_env(
+    env: str | Mapping[str, Any] | SafetyGymConfig | VelocityConfig,
+    *,
+    num_envs: int = 1,
+    device: torch.device | str = "cpu",
+    seed: int | None = None,
+    num_threads: int = 0,
+    transforms: Mapping[str, Any] | None = None,
+    evaluating: bool = False,
+    **keys: Any,
+) -> ConstrainedEnv:
+    """Make a batch of environments of any family.
+
+    Args:
+        env: A name, also one from `store_config`; a configuration of Safety Gym or of the velocity
+            family; or a node of the group `env`: `name`, `_target_` and the family's keys.
+        num_envs: Number of environments, N.
+        device: Device of the TensorDicts.
+        seed: Determines every random draw; None takes a seed from torch's generator.
+        num_threads: Largest number of threads that step them; 0 for one per core.
+        transforms: Name -> transform, or its node, as `transform_env` takes them.
+        evaluating: Whether policies are evaluated; transforms that only help learning are then off.
+        keys: Keys of the environment to change, such as ``hazards_num=12``.
+
+    Raises:
+        ConfigError: For an unknown name or key, or a value that cannot be used.
+        TargetError: For a family whose target a configuration may not name.
+        ContractError: If an environment of the user's family does not fulfil the contract.
+
+    Examples:
+        >>> make_env("PointGoal1", num_envs=2, hazards_num=12).config.hazards_num
+        12
+        >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
+        torch.Size([2])
+    """
+    # imported here, because environments need torch and their names do not
+    from safe_rl.envs.contract import ContractError, check_constrained_env
+    from safe_rl.envs.safety_gym.env import SafetyGymEnv
+    from safe_rl.envs.transforms import transform_env
+
+    given = dict(num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)  # noqa: C408
+    node = dict(env if isinstance(env, Mapping) else env_node(env))
+    for key in keys.keys() - node.keys():
+        if meant := did_you_mean(key, [*given, "transforms"], 0.85):
+            raise ConfigError(f"There is no argument '{key}'.{meant}")
+    node |= keys
+    target = node.pop("_target_", None)
+    node.pop("name", None)
+    build = SafetyGymEnv if target is None else locate(target, key="env._target_")
+    try:
+        signature(build).bind(node, **given)
+    except TypeError as error:
+        raise ContractError(
+            f"{target}: {error}. It is called with the keys of env as the first argument, and with "
+            f"{', '.join(given)} by name."
+        ) from None
+    made = build(node, **given)
+    if transforms:
+        made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
+    if target is not None or transforms:
+        check_constrained_env(made)
+    if list(made.batch_size) != [num_envs]:
+        number = made.batch_size[0]
+        raise ContractError(
+            f"{target} made {number} environments instead of {num_envs}, 'num_envs'."
+        )
+    return made
 
 
 # `Safexp-{name}-v0`, and `Safexp-Custom-v0` with the default of every key. They take a `config`

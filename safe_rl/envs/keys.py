@@ -1,7 +1,12 @@
-"""Keys of environments: a type with its range, a default and a meaning each, also for Hydra."""
+"""Keys of environments: a type with its range, a default and a meaning each, also for Hydra.
+
+Also the error for a key that cannot be used, the names of costs, and the key `outside`, which gives
+costs for leaving a range.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field, make_dataclass
 from functools import cache, partial
@@ -12,10 +17,29 @@ from annotated_types import Interval
 from pydantic import ValidationError
 
 from safe_rl import checks
-from safe_rl.checks import SettingError, Share, Text
-from safe_rl.envs.errors import ConfigError
+from safe_rl.checks import SettingError
 
-__all__ = ["Count", "Key", "NotNegative", "Number", "Positive", "Share", "Text", "checked"]
+
+class ConfigError(ValueError):
+    """A configuration cannot be used; the message names the key and what to change."""
+
+
+def on_cpu_only(key: str) -> str:
+    """Return a hint for MuJoCo Warp's keys, which only Safety Gym has; else an empty text."""
+    if key not in ("physics", "physics_buffers"):
+        return ""
+    return (
+        f" Only Safety Gym's environments have '{key}': the physics of all others, such as the "
+        "velocity family, runs on the CPU only. Remove it, and preset=gpu, which sets 'physics'."
+    )
+
+
+def require_integer(name: str, value: Any, lowest: int) -> None:
+    """Raise ConfigError unless an argument is an integer from `lowest` to 2⁶³ - 1."""
+    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value < 2**63:
+        words = f"an integer of at least {lowest} and below 2**63"
+        raise ConfigError(f"'{name}' must be {words}, got {value!r}.")
+
 
 # float32 can hold the square of the largest number
 Number = Annotated[float, Interval(ge=-1e9, le=1e9)]
@@ -119,3 +143,72 @@ def _hydra_type(annotation: Any) -> Any:
         item = _hydra_type(inner[0])
         return list[item] if item in (bool, int, float, str) else Any  # type: ignore[valid-type]
     return annotation if annotation in (bool, int, float, str) else Any
+
+
+COST = "cost"
+_FORM = (
+    "'{cost_speed: [2, -4, 4]}' (column of the observation, lowest, highest), or for another entry "
+    "[thdot, -4, 4], or with its column [thdot, 0, -4, 4]"
+)
+
+
+class CostRange(NamedTuple):
+    """A range of values without a cost; values outside it have a cost.
+
+    Attributes:
+        entry: Name of the entry, with dots where it is nested.
+        column: Column of the entry, counted from 0.
+        low: Lowest value without a cost.
+        high: Highest value without a cost.
+    """
+
+    entry: str
+    column: int
+    low: float
+    high: float
+
+
+def is_cost(name: Any) -> bool:
+    """Whether a name is that of a cost: `cost` or `cost_<kind>`."""
+    return name == COST or str(name).startswith(f"{COST}_")
+
+
+def parse_ranges(outside: Any) -> dict[str, CostRange]:
+    """Return the ranges of the configuration key `outside`, by the names of their costs.
+
+    Args:
+        outside: Name -> (entry, column, lowest, highest). The default entry is the observation. The
+            default column of another entry is the first one. None means no ranges.
+
+    Raises:
+        ConfigError: If a name, the form of a range or its bounds are wrong.
+
+    Examples:
+        >>> parse_ranges({"cost_speed": ["thdot", -4, 4]})
+        {'cost_speed': CostRange(entry='thdot', column=0, low=-4, high=4)}
+    """
+    if outside is not None and not isinstance(outside, Mapping):
+        raise ConfigError(f"'outside' must have the form {_FORM}; got {outside!r}.")
+    ranges = {}
+    for name, row in (outside or {}).items():
+        full = list(row) if isinstance(row, list | tuple) else []
+        if len(full) == 3:
+            full = [full[0], 0, *full[1:]] if isinstance(full[0], str) else ["observation", *full]
+        if not _is_range(full):
+            raise ConfigError(f"'outside' must have the form {_FORM}; got {name}: {row!r}.")
+        kept = CostRange(full[0], int(full[1]), *full[2:])
+        if not kept.low <= kept.high or (math.isinf(kept.low) and math.isinf(kept.high)):
+            raise ConfigError(f"'outside': {name} cannot have the range {kept.low} to {kept.high}.")
+        if not is_cost(name):
+            raise ConfigError(f"'outside': costs are called cost or cost_<kind>, not '{name}'.")
+        ranges[name] = kept
+    return ranges
+
+
+def _is_range(row: list[Any]) -> bool:
+    """Whether a row is an entry, a column and two numbers."""
+    numbers = row[1:]
+    are_numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+    if len(row) != 4 or not isinstance(row[0], str) or not are_numbers:
+        return False
+    return numbers[0] >= 0 and numbers[0] % 1 == 0

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.errors import require_integer
+from safe_rl.envs.keys import require_integer
 from safe_rl.envs.physics import Physics
 
 

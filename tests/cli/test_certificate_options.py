@@ -37,7 +37,7 @@ def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail
         ([], True, True),
         ([], False, False),
         (["transforms=[early_termination]"], False, True),
-        (["transforms=[reward_scale]"], False, False),
+        (["transforms=[sensor_noise]"], False, False),
     ],
 )
 def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, is_constrained, is_to):

@@ -14,7 +14,6 @@ from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
     EarlyTermination,
-    RewardScale,
 )
 from safe_rl.evaluation.episodes import collect_episodes
 
@@ -40,7 +39,7 @@ def test_a_filter_gets_the_positions_before_the_step_and_the_layout_if_it_asks_f
         return step["action"]
 
     node = {"_target_": "safe_rl.envs.transforms.ActionFilter", "filter": partial(shield)}
-    env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"f": node, "s": RewardScale(0.5)})
+    env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"f": node})
     state = env.reset()
     for _ in range(3):
         # the joints of a planar robot are the position of its body

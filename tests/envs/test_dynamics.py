@@ -8,7 +8,7 @@ import torch
 from safe_rl.envs import ConfigError, SafetyGymEnv
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.config import ROBOTS
-from safe_rl.envs.velocity.runner_model import ASSETS
+from safe_rl.envs.velocity.runner import ASSETS
 from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 FILES = {name: str(path) for name, path in ROBOTS.items()} | {

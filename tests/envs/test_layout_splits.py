@@ -6,7 +6,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 
 from safe_rl.envs import LayoutError, SafetyGymEnv, resolve
-from safe_rl.envs.safety_gym.draws import LayoutsAhead
+from safe_rl.envs.safety_gym.episodes import LayoutsAhead
 
 # What a layout pins: positions, yaws, the first goal button.
 PINNED = ("layout", "start_pose", "qpos", "goal_pos", "goal_button", "target_quat")

@@ -5,8 +5,7 @@ import torch
 from looking import no_looks
 
 from safe_rl.envs import SafetyGymEnv
-from safe_rl.envs.physics import OUTPUTS, STATE, Physics
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import OUTPUTS, STATE, BatchPhysics, Physics
 
 EVERYTHING = {
     **{"robot_base": "point", "task": "goal", "goal_size": 3.0, "action_noise": 0.1},
@@ -31,7 +30,7 @@ class WaitingPhysics(Physics):
 
     def __init__(self, model, num_envs, dtype):
         self.dtype, self._batch = dtype, BatchPhysics(model, num_envs, 1)
-        self.timestep, self.memory = self._batch.timestep, self._batch.memory
+        self.timestep, self.actuator_state = self._batch.timestep, self._batch.actuator_state
         self.inside, self.wrong = False, []
         for name in STATE + OUTPUTS:
             setattr(self, name, getattr(self._batch, name).to(dtype, copy=True))

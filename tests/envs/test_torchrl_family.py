@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 from safe_rl import trust
 from safe_rl.cli import evaluate, report
 from safe_rl.envs import ConfigError, complete_env, make_env
-from safe_rl.envs.families import TORCHRL_CLASSES
+from safe_rl.envs.torchrl import TORCHRL_CLASSES
 from safe_rl.envs.torchrl.step_entries import Observe
 from safe_rl.runs.table import read_table
 from safe_rl.trust import TargetError

@@ -6,7 +6,7 @@ import math
 import gymnasium
 import pytest
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityConfig, resolve_velocity
 from safe_rl.envs.velocity.velocity_config import RUNNERS

@@ -12,7 +12,7 @@ from run_configs import compose_config
 pytest.importorskip("mujoco_warp")
 
 from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics
 from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import ROBOTS

@@ -10,7 +10,6 @@ from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
     EarlyTermination,
-    RewardScale,
     Saute,
     SensorNoise,
     Simmer,
@@ -46,7 +45,6 @@ TRANSFORMS = {
     "simmer": lambda: Simmer({"cost": 2.0}, first=0.25, steps=16, **SAUTE),
     "early_termination": lambda: EarlyTermination({"cost": 2.0}),
     "action_filter": lambda: ActionFilter(half_speed),
-    "reward_scale": lambda: RewardScale(0.5),
     "action_repeat": lambda: ActionRepeat(3),  # the last one
 }
 ENVIRONMENTS = {

@@ -12,10 +12,9 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torchrl.envs import GymWrapper
 
-from safe_rl.envs.costs import COST, is_cost
-from safe_rl.envs.errors import ConfigError, require_integer
 from safe_rl.envs.families import FOREIGN, complete_foreign
 from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
+from safe_rl.envs.keys import COST, ConfigError, is_cost, require_integer
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
@@ -77,24 +76,23 @@ def from_gymnasium(
     require_integer("num_envs", num_envs, lowest=1)
     make = _maker(env, kwargs, num_steps)
     keys, length = _describe(make, cost_keys, num_steps, outside)
-    settings = (num_envs, keys, length, outside, flatten, privileged, seed, device)
-    return _batch(make, *settings, watch=cost_keys is None)
+    config = {"cost_keys": keys, "num_steps": length, "outside": outside, "flatten": flatten}
+    config["privileged"] = privileged
+    return _batch(make, config, num_envs, seed, device, watch=cost_keys is None)
 
 
 def _batch(
     make: MakeEnv,
+    config: Mapping[str, Any],
     num_envs: int,
-    keys: list[str],
-    length: int,
-    outside: Any,
-    flatten: bool,
-    privileged: str | None,
     seed: int | None,
     device: torch.device | str,
     *,
-    watch: bool,
+    watch: bool = True,
 ) -> GymnasiumEnv:
     """Make N environments; with `watch`, there is a warning about costs that are not counted."""
+    keys, length = [*dict.fromkeys(config["cost_keys"])], config["num_steps"]
+    privileged, flatten = config.get("privileged"), config.get("flatten", True)
     # a dictionary keeps its entries until the privileged one is taken out
     is_vector = flatten and privileged is None
     make_one = partial(make_adapted, make, length, is_vector, keys, watch)
@@ -104,9 +102,8 @@ def _batch(
     entries = list(map(dotted, base.observation_spec.keys(True, True)))
     observed = [name for name in entries if name != privileged]
     base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
-    config = {"cost_keys": keys, "outside": outside, "observe": observed, "flatten": flatten}
-    config["privileged"] = privileged
-    batch = GymnasiumEnv(base, {**config, "cost": None, "num_steps": length})
+    whole = {"outside": None, "cost": None, **config, "observe": observed, "flatten": flatten}
+    batch = GymnasiumEnv(base, {**whole, "cost_keys": keys, "privileged": privileged})
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
 
@@ -184,18 +181,7 @@ def _make_node(
     make = maker(config)
     try:
         require_integer("num_envs", num_envs, lowest=1)
-        return _batch(
-            make,
-            num_envs,
-            [*dict.fromkeys(config["cost_keys"])],
-            config["num_steps"],
-            config.get("outside"),
-            config.get("flatten", True),
-            config.get("privileged"),
-            None if seed is None else spread_seed(seed),
-            device,
-            watch=True,
-        )
+        return _batch(make, config, num_envs, None if seed is None else spread_seed(seed), device)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
@@ -219,10 +205,10 @@ def _describe(
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
     if cost_keys is not None and num_steps is not None:  # environments may be slow to make
-        return [*dict.fromkeys(cost_keys)], num_steps
+        return list(cost_keys), num_steps
     probe = make()
     try:
-        keys = _find_costs(probe) if cost_keys is None else [*dict.fromkeys(cost_keys)]
+        keys = _find_costs(probe) if cost_keys is None else list(cost_keys)
         if cost_keys is None and not keys and not outside:
             raise ValueError(
                 f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "

@@ -20,10 +20,9 @@ from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
-from safe_rl.envs.costs import COST, is_cost
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import COST, ConfigError, is_cost
 from safe_rl.envs.pictures import resize
-from safe_rl.envs.torchrl.torchrl_env import TorchRLEnv
+from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds

@@ -15,8 +15,7 @@ from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite
 
-from safe_rl.envs.costs import COST
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import COST, ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.env import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve

@@ -1,19 +1,24 @@
-"""The interface of a physics backend: N MuJoCo simulations that are advanced together."""
+"""N MuJoCo simulations that are advanced together: the interface of a backend, and the CPU's.
+
+The CPU's is `mujoco.batch.Batch`, a C++ thread pool over rows of state.
+"""
 
 from __future__ import annotations
 
+import os
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
 
-if TYPE_CHECKING:
-    import torch
-    from torch import Tensor
-
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from torch import Tensor
 
 STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
-"""Tensors of the state, besides the memory of actuators and sensors."""
-MEMORY = ("act", "history")
+"""Tensors of the state, besides that of actuators and sensors."""
+ACTUATOR_STATE = ("act", "history")
 OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 
 
@@ -37,8 +42,8 @@ class Physics(ABC):
         qpos, qvel, qacc_warmstart: State of the joints, [N, nq], [N, nv] and [N, nv].
         ctrl: Controls [N, nu].
         mocap_pos, mocap_quat: Poses of the mocap bodies [N, nmocap, 3] (m) and [N, nmocap, 4].
-        memory: State of actuators and sensors with memory, `act` [N, na] and `history`
-            [N, nhistory]; without entries that the model does not need.
+        actuator_state: State of filtered and delayed actuators and sensors, `act` [N, na] and
+            `history` [N, nhistory]; without entries that the model does not need.
         xpos, xmat, sensordata, subtree_com: The outputs, [N, nbody, 3] (m), [N, nbody, 3, 3],
             [N, nsensordata] and [N, nbody, 3] (m).
     """
@@ -54,7 +59,7 @@ class Physics(ABC):
     ctrl: Tensor
     mocap_pos: Tensor
     mocap_quat: Tensor
-    memory: Mapping[str, Tensor]
+    actuator_state: Mapping[str, Tensor]
     xpos: Tensor
     xmat: Tensor
     sensordata: Tensor
@@ -123,3 +128,175 @@ class Physics(ABC):
         """
         if wrong.any():
             raise error()
+
+
+_PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+_NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
+
+
+MOST_FAILURES = 10  # steps in a row in which all simulations fail
+
+
+class PhysicsError(RuntimeError):
+    """All simulations fail in every step."""
+
+
+class BatchPhysics(Physics):
+    """N simulations on the CPU, in float64.
+
+    Threads do not survive a fork: the process that steps simulations with several threads must
+    make them itself, or be spawned.
+
+    Args:
+        model: The compiled model; sleeping follows its options.
+        num_envs: Number of simulations, N.
+        num_threads: Threads that step them, 0 for one per core.
+        outputs: Names of the fields of `MjData` that are read; every call copies them.
+
+    Attributes:
+        outputs: All of these fields, by name.
+    """
+
+    device = torch.device("cpu")
+    dtype = torch.float64
+    waits = False
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        num_threads: int,
+        outputs: Sequence[str] = OUTPUTS,
+    ) -> None:
+        log = mujoco.MjLogConfig.get()
+        log.logto_file = False  # or MuJoCo writes MUJOCO_LOG.TXT into the working directory
+        log.logto_console = False  # a line for every failure; `failed` has one for all of them
+        log.set()
+        sleeps = bool(model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP)
+        has_threads = (num_threads or os.cpu_count() or 1) > 1
+        self._process = os.getpid() if has_threads else None
+        self.timestep = float(model.opt.timestep)
+        self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
+        # All fields are bound before the first call: a field that is bound later starts as zero.
+        sizes = zip(ACTUATOR_STATE, (model.na, model.nhistory), strict=True)
+        delayed = [name for name, size in sizes if size]
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            bound = {
+                name: torch.from_numpy(self._batch.bind(name))
+                for name in (*STATE, *delayed, *outputs)
+            }
+        for name in STATE:
+            setattr(self, name, bound[name])
+        self.actuator_state = {name: bound[name] for name in delayed}
+        self.outputs = {name: bound[name] for name in outputs}
+        if "xmat" in self.outputs:
+            self.outputs["xmat"] = self.outputs["xmat"].view(num_envs, model.nbody, 3, 3)
+        for name in set(OUTPUTS).intersection(outputs):
+            setattr(self, name, self.outputs[name])
+        self._disableflags = self._batch.expand("opt.disableflags")
+        self._with_sensors = int(model.opt.disableflags)
+        self._warnings = np.zeros_like(self._batch.warning)
+        self._num_failures, self._all_failed = 0, 0
+
+    def reset(self, mask: Tensor) -> None:
+        """Set the simulations in `mask` to the model's initial state, see `Physics`."""
+        self._check_process()
+        self._batch.reset(mask.numpy(), stage=_NO_STAGE)
+        self._warnings[:] = self._batch.warning
+
+    def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
+        """Compute the outputs from the state, see `Physics`.
+
+        Without `sensors`, the readings, and quantities that only sensors need, stay unchanged.
+        """
+        self._check_process()
+        self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
+        self._batch.forward(None if mask is None else mask.numpy())
+        self._disableflags[:] = self._with_sensors
+
+    def step(
+        self,
+        num_substeps: int,
+        mocap_path: Tensor | None = None,
+        counts: Tensor | None = None,
+        refresh: bool = True,
+    ) -> Tensor:
+        """Advance by substeps and compute the outputs, see `Physics`.
+
+        Without `refresh`, the outputs stay as `mj_step` leaves them. They belong to the last state
+        that the last substep evaluated: with the Runge-Kutta integrator, to its fourth stage.
+        """
+        self._check_process()
+        # Sensors are not read between substeps; without them the result is the same to the bit.
+        self._disableflags[:] = self._with_sensors | _NO_SENSORS
+        if counts is None:
+            self._substeps(num_substeps, mocap_path, None)
+        else:
+            for count in counts.unique().tolist():
+                self._substeps(count, mocap_path, (counts == count).numpy())
+        self._disableflags[:] = self._with_sensors
+        if refresh:
+            self._batch.forward()
+        return self.failed()
+
+    def failed(self) -> Tensor:
+        """Return the simulations that failed since the last call of this or `step`, bool [N]."""
+        # MuJoCo resets a bad state by itself, and only increments a warning counter.
+        counts = self._batch.warning
+        if np.array_equal(counts, self._warnings):
+            self._all_failed = 0
+            return torch.zeros(len(counts), dtype=torch.bool, device=self.device)
+        failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
+        counts[failed] = 0  # a next failure increments them again
+        self._warnings[:] = counts
+        self.ctrl[failed] = 0.0
+        self._report(failed)
+        return torch.from_numpy(failed)
+
+    def _report(self, failed: np.ndarray) -> None:
+        """Say once that simulations fail; raise if all of them do, several times in a row."""
+        if failed.any() and not self._num_failures:
+            warnings.warn(
+                f"The physics of {failed.sum()} of {len(failed)} simulations failed (a state that "
+                "is huge or no number): their episodes end. Later failures are not shown.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        self._num_failures += int(failed.sum())
+        self._all_failed = self._all_failed + 1 if failed.all() else 0
+        if self._all_failed == MOST_FAILURES:
+            raise PhysicsError(
+                f"The physics of all simulations failed in {MOST_FAILURES} steps in a row, "
+                f"{self._num_failures} failures in all: check the robot's file and the actions."
+            )
+
+    def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
+        """Cast rays into the simulations as their state is now, see `Physics`."""
+        seen = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
+        seen[group] = 1
+        distance, _ = self._batch.ray(
+            origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
+        )
+        return torch.from_numpy(distance)
+
+    def _check_process(self) -> None:
+        """Raise in a forked process: it has no threads, and would wait for them for ever."""
+        if self._process is not None and self._process != os.getpid():
+            raise RuntimeError(
+                "This environment was made before its process was forked, and its threads do not "
+                "survive a fork. Make it in the process that steps it, start processes with the "
+                "method 'spawn', or give it num_threads=1."
+            )
+
+    def _substeps(self, count: int, path: Tensor | None, mask: np.ndarray | None) -> None:
+        if count == 0:
+            return
+        if path is None:
+            self._batch.rollout(count, record=(), ids=mask)
+            return
+        rows = slice(None) if mask is None else torch.from_numpy(mask)
+        moved = path[rows, :count].flatten(2)
+        control = torch.cat([self.ctrl[rows, None].expand(-1, count, -1), moved], -1)
+        self._batch.rollout(count, control.numpy(), _PATH_INPUTS, record=(), ids=mask)

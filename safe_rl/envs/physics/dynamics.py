@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import mujoco
 import numpy as np
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 
 _LINEAR = (
     {int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)},

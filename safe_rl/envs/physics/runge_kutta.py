@@ -17,7 +17,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics
 
 _STAGES = (0.5, 0.5, 1.0)  # times of the second, third and fourth stage, in substeps
 _SMALL_ANGLE = 1e-7  # rad; a lower bound of angles, against divisions by 0

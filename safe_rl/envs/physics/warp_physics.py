@@ -13,7 +13,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from safe_rl.envs.physics import MEMORY, OUTPUTS, STATE, Physics
+from safe_rl.envs.physics import ACTUATOR_STATE, OUTPUTS, STATE, Physics
 from safe_rl.envs.physics.warp_kernels import (
     align_capsules,
     find_failures,
@@ -23,7 +23,7 @@ from safe_rl.envs.physics.warp_kernels import (
     restore_rows,
 )
 
-_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *MEMORY)  # what a substep changes
+_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *ACTUATOR_STATE)  # what a substep changes
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
 _LOST_CONTACTS = int(_LOST.BROADPHASE | _LOST.NARROWPHASE | _LOST.CCD | _LOST.CONTACT_MATCH)
@@ -95,12 +95,14 @@ class WarpPhysics(Physics):
     def _bind(self, model: mujoco.MjModel) -> None:
         """Share memory with torch, and store the initial state of a simulation."""
         data, num_envs = self._data, self._data.nworld
-        shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *MEMORY, *OUTPUTS)}
+        shared = {
+            name: wp.to_torch(getattr(data, name)) for name in (*STATE, *ACTUATOR_STATE, *OUTPUTS)
+        }
         for name in (*STATE, *OUTPUTS):
             setattr(self, name, shared[name])
-        sizes = dict(zip(MEMORY, (model.na, model.nhistory), strict=True))
-        self.memory = {name: shared[name] for name in MEMORY if sizes[name]}
-        initial = [name for name in (*STATE, *MEMORY) if shared[name].numel()]
+        sizes = dict(zip(ACTUATOR_STATE, (model.na, model.nhistory), strict=True))
+        self.actuator_state = {name: shared[name] for name in ACTUATOR_STATE if sizes[name]}
+        initial = [name for name in (*STATE, *ACTUATOR_STATE) if shared[name].numel()]
         flat = {name: shared[name].view(num_envs, -1) for name in initial}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}

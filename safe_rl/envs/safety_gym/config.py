@@ -6,12 +6,11 @@ Lengths are in metres, angles in radians, and times in environment steps unless 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
-from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.keys import Key, checked, describe
+from safe_rl.envs.keys import ConfigError, Key, checked, describe
 from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.naming import did_you_mean
 
@@ -31,7 +30,6 @@ KEYS = dict(_BUILT_IN)
 """The built-in keys and the registered ones."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class SafetyGymConfig(Keys):
     """Everything that defines one environment.
 
@@ -49,18 +47,17 @@ class SafetyGymConfig(Keys):
         5
     """
 
-    def __new__(cls, **values: Any) -> SafetyGymConfig:
-        """Make an object of the class that has the registered keys, too."""
+    def __init__(self, **values: Any) -> None:
         for name in values.keys() - KEYS.keys():
             raise ConfigError(
                 f"Unknown configuration key '{name}'.{did_you_mean(name, KEYS)} "
                 "SafetyGymConfig lists every key with its default."
             )
-        return object.__new__(_extended)
-
-    def __post_init__(self) -> None:
         for name, row in KEYS.items():
-            vars(self)[name] = checked(name, row.annotation, getattr(self, name))
+            vars(self)[name] = checked(name, row.annotation, values.get(name, row.default))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise FrozenInstanceError(f"A configuration cannot change: use replace({name}=…).")
 
     def __getattr__(self, name: str) -> Any:
         """Return the default of a key that was registered after this configuration was made."""
@@ -84,7 +81,7 @@ class SafetyGymConfig(Keys):
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> SafetyGymConfig:
         """Build a configuration from a flat mapping."""
-        return SafetyGymConfig(**{str(key): value for key, value in values.items()})
+        return cls(**{str(key): value for key, value in values.items()})
 
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, checked like a new one."""
@@ -93,14 +90,6 @@ class SafetyGymConfig(Keys):
     def to_dict(self) -> dict[str, Any]:
         """Return a flat mapping of all keys, which `from_dict` accepts."""
         return {name: getattr(self, name) for name in KEYS}
-
-
-_extended: type[SafetyGymConfig] = SafetyGymConfig
-
-
-def robot_path(base: str) -> Path:
-    """Return the file of a robot, given by its name in `ROBOTS` or its path."""
-    return ROBOTS.get(base, Path(base))
 
 
 def infer_key(name: str, default: Any) -> Key:
@@ -149,20 +138,9 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
     Raises:
         ConfigError: If a key is built in, or a default does not have the type of its key.
     """
-    global _extended
     for name, row in keys.items():
         if name in _BUILT_IN:
             raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
         checked(name, row.annotation, row.default)
     KEYS.clear()
     KEYS.update({**_BUILT_IN, **keys})
-    added = [(name, Any, field(default=row.default)) for name, row in keys.items()]
-    _extended = make_dataclass(
-        "SafetyGymConfig",
-        added,
-        bases=(SafetyGymConfig,),
-        frozen=True,
-        kw_only=True,
-        eq=False,
-        repr=False,
-    )

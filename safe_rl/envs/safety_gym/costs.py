@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.world import World
 

@@ -47,6 +47,10 @@ class Motion(Enum):
     VIRTUAL = "virtual"
 
 
+PUSHED = (Motion.FREE, Motion.GUIDED)
+"""Motions of bodies that can be pushed."""
+
+
 class Geom(NamedTuple):
     """One shape of an element: MuJoCo type, size [m] as MJCF has it, position in the body [m]."""
 
@@ -84,34 +88,17 @@ class Element:
     flag: str = ""
     always_observed: bool = False
 
-    def count(self, config: SafetyGymConfig) -> int:
-        """Return the number of objects."""
-        if self.singular:
-            return int(self.kind in TASKS[config.task].elements)
-        return getattr(config, f"{self.kind}_num")
+    def names(self, config: SafetyGymConfig) -> list[str]:
+        """Return the names of the objects."""
+        if self.label == self.kind:
+            return [self.label] if self.kind in TASKS[config.task].elements else []
+        return [f"{self.label}{i}" for i in range(getattr(config, f"{self.kind}_num"))]
 
     def observed(self, config: SafetyGymConfig) -> bool:
         """Whether the observation has a lidar for this kind."""
-        flag = self.flag or f"observe_{self.kind}"
-        at_origin = self.kind in TASKS[config.task].at_origin
-        return getattr(config, flag) and (
-            self.always_observed or at_origin or self.count(config) > 0
-        )
-
-    def names(self, config: SafetyGymConfig) -> list[str]:
-        """Return the names of the objects."""
-        count = self.count(config)
-        return [self.label] if self.singular else [f"{self.label}{i}" for i in range(count)]
-
-    @property
-    def is_free(self) -> bool:
-        """Whether the objects are bodies that can be pushed."""
-        return self.motion in (Motion.FREE, Motion.GUIDED)
-
-    @property
-    def singular(self) -> bool:
-        """Whether there is at most one object, whose name has no index."""
-        return self.label == self.kind
+        exists = self.kind in TASKS[config.task].at_origin or self.names(config)
+        flag = getattr(config, self.flag or f"observe_{self.kind}")
+        return flag and (self.always_observed or bool(exists))
 
 
 def _box_geoms(config: SafetyGymConfig) -> tuple[Geom, ...]:

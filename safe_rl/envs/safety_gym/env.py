@@ -12,34 +12,31 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import Physics
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics, Physics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
-from safe_rl.envs.safety_gym.draws import (
+from safe_rl.envs.safety_gym.episodes import (
+    OPTIONAL_KEYS,
     LayoutsAhead,
     Purpose,
     control_noise,
     draw_layouts,
     draw_substeps,
-    next_goals,
-    pick_layouts,
-    start_episodes,
-)
-from safe_rl.envs.safety_gym.layouts import plan_placements
-from safe_rl.envs.safety_gym.observations import make_observer, observation_spec
-from safe_rl.envs.safety_gym.privileged import Privileged
-from safe_rl.envs.safety_gym.renderer import WorldRenderer
-from safe_rl.envs.safety_gym.state import (
-    OPTIONAL_KEYS,
     gremlin_path,
     make_world,
+    next_goals,
+    pick_layouts,
+    place_mocaps,
+    point_goal_at_button,
     put,
     refresh,
+    start_episodes,
     stored_tensors,
-    write_state,
 )
+from safe_rl.envs.safety_gym.layouts import plan_placements
+from safe_rl.envs.safety_gym.observations import Privileged, make_observer, observation_spec
+from safe_rl.envs.safety_gym.renderer import WorldRenderer, vision_block
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goal_is_button
 from safe_rl.envs.safety_gym.warp_backend import make_warp_physics
@@ -116,7 +113,8 @@ class SafetyGymEnv(SimulatedEnv):
         self._plan = plan_placements(scene, physics.device)
         draw = partial(draw_layouts, self._plan, physics)
         self._layouts = LayoutsAhead(draw, num_envs, self._plan.num_columns, physics.device)
-        self._observer = make_observer(scene, physics.device)
+        vision = [vision_block(scene)] if self.config.observe_vision else []
+        self._observer = make_observer(scene, physics.device, vision)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
         self._costs = active_costs(self.config)
@@ -125,7 +123,7 @@ class SafetyGymEnv(SimulatedEnv):
         if self.config.observe_privileged:
             self._privileged = Privileged(self._world, len(self.cost_keys))
             self.privileged_layout = self._privileged.columns
-            self._remembered = self._privileged.memory
+            self._remembered = self._privileged.past
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._announce(scene.model, observed, highest, seed)
@@ -291,7 +289,28 @@ class SafetyGymEnv(SimulatedEnv):
         self._fixed_layout = state.get("fixed_layout", self._fixed_layout).clone()
         if "layout" not in state and not self._episode.any():
             self.reset()
-        write_state(self._world, state)
+        self._write_worlds(state)
         for name, tensor in self._remembered.items():
             tensor.copy_(state.get(name, torch.zeros_like(tensor)))
         self._measured.copy_(self._task.measure(self._world))
+
+    def _write_worlds(self, state: TensorDictBase) -> None:
+        """Set N worlds to a state that fits them, and compute all outputs."""
+        world, scene, physics = self._world, self._world.scene, self._physics
+        target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
+        everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
+        physics.reset(everywhere)
+        for key, tensor in stored_tensors(world).items():
+            if key in state:
+                tensor.copy_(state[key])
+        physics.mocap_quat[:, : scene.num_targets] = target_quat
+        world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
+        if goal_is_button(scene.config.task):
+            point_goal_at_button(world, everywhere)
+        elif "goal" in scene.slots:
+            goal = scene.slots["goal"].start
+            world.positions[:, goal] = state["goal_pos"]
+            world.layout[:, 1 + goal] = state["goal_pos"][:, :2]
+        place_mocaps(world)
+        physics.forward()
+        refresh(world)

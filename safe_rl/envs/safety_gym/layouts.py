@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BY_KIND, PLACEMENT_ORDER

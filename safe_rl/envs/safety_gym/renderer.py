@@ -15,10 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.pictures import Camera, Marker, Pictures, resize
-from safe_rl.envs.safety_gym.bodies import TRACK, VISION
-from safe_rl.envs.safety_gym.building import build_scene
+from safe_rl.envs.safety_gym.building import TRACK, VISION, build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.lidar import lidar_blocks

@@ -20,8 +20,8 @@ from typing import Any
 
 import mujoco
 
-from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.safety_gym.config import BUNDLED, PATHS_OF_2019, robot_path
+from safe_rl.envs.keys import ConfigError
+from safe_rl.envs.safety_gym.config import BUNDLED, PATHS_OF_2019, ROBOTS
 from safe_rl.files import read_bounded
 from safe_rl.naming import did_you_mean
 
@@ -88,13 +88,12 @@ def _refused(path: Path, what: str) -> ConfigError:
     return ConfigError(f"'robot_base': {path} {what}")
 
 
-def load_robot(base: str) -> Robot:
-    """Load a robot, by name or file, and check that it can be placed, moved and stepped.
+def load_robot(path: Path) -> Robot:
+    """Load a robot from its file, and check that it can be placed, moved and stepped.
 
     Raises:
         ConfigError: If MuJoCo cannot load the file, or an environment cannot use the robot.
     """
-    path = robot_path(base)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if spec.keys:
@@ -201,7 +200,7 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
 def own_robot(keys: Mapping[str, Any]) -> Path | None:
     """Return the file of the robot in a mapping of keys; None for a bundled robot."""
     base = str(keys.get("robot_base", "car"))
-    path = robot_path(base)
+    path = ROBOTS.get(base, Path(base))
     is_bundled = path.parent == BUNDLED or (base in PATHS_OF_2019 and not path.is_file())
     return None if is_bundled else path
 
@@ -227,7 +226,7 @@ def copy_robot(path: Path, folder: Path) -> Path:
     copy = folder / path.name
     if not is_robot(copy, folder, fingerprint(path)):
         raise ConfigError(f"'robot_base': a copy of {path} is another robot.")
-    load_robot(str(copy))
+    load_robot(copy)
     return copy
 
 

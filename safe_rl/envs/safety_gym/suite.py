@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import PATHS_OF_2019, ROBOTS, SafetyGymConfig
 from safe_rl.envs.safety_gym.config_keys import LARGEST_SEED
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button

@@ -10,9 +10,8 @@ from typing import Any
 import mujoco
 import torch
 
-from safe_rl.envs.errors import ConfigError
-from safe_rl.envs.physics import Physics
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.keys import ConfigError
+from safe_rl.envs.physics import BatchPhysics, Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.extras import require_extra
 

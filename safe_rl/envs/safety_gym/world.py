@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 from torch import Tensor
 
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.naming import did_you_mean

@@ -15,8 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.costs import COST, is_cost, parse_ranges
-from safe_rl.envs.errors import ConfigError
+from safe_rl.envs.keys import COST, ConfigError, is_cost, parse_ranges
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import locate
 

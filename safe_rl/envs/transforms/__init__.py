@@ -1,10 +1,13 @@
 """TorchRL transforms that change a constrained problem, for any environment and algorithm."""
 
 from safe_rl.envs.transforms.action_transforms import ActionDelay, ActionFilter, ActionRepeat
-from safe_rl.envs.transforms.base import ConstraintTransform
-from safe_rl.envs.transforms.environment import TransformedConstrainedEnv, transform_env
+from safe_rl.envs.transforms.environment import (
+    ConstraintTransform,
+    TransformedConstrainedEnv,
+    transform_env,
+)
 from safe_rl.envs.transforms.observation_transforms import ObservedCosts, PolicyMemory, SensorNoise
-from safe_rl.envs.transforms.reward_transforms import EarlyTermination, RewardScale, Saute, Simmer
+from safe_rl.envs.transforms.reward_transforms import EarlyTermination, Saute, Simmer
 
 __all__ = [
     "ActionDelay",
@@ -14,7 +17,6 @@ __all__ = [
     "EarlyTermination",
     "ObservedCosts",
     "PolicyMemory",
-    "RewardScale",
     "Saute",
     "SensorNoise",
     "Simmer",

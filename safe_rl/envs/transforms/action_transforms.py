@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
 from safe_rl.checks import Text
-from safe_rl.envs.transforms.base import ConstraintTransform
+from safe_rl.envs.transforms.environment import ConstraintTransform
 from safe_rl.naming import STEPS_TAKEN
 
 

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from safe_rl.checks import Text, Weight
 from safe_rl.envs import rng
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.transforms.base import (
+from safe_rl.envs.transforms.environment import (
     ConstraintTransform,
     check_known,
     costs_of,

@@ -1,11 +1,12 @@
-"""Transforms of rewards and terminations: RewardScale, EarlyTermination, Sauté RL and Simmer."""
+"""Transforms of rewards and terminations: EarlyTermination, Sauté RL and Simmer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import MinLen
 from pydantic import FiniteFloat, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -13,63 +14,16 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 
 from safe_rl.checks import Fraction
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.transforms.base import (
+from safe_rl.envs.transforms.environment import (
     ConstraintTransform,
-    check_budgets,
     costs_of,
     unbounded_like,
     widen,
 )
 
 BUDGET = "budget"
+Budgets = Annotated[Mapping[str, PositiveFloat], MinLen(1)]
 _ROUNDING = 1e-7  # of a budget: the relative rounding error of costs in single precision is lower
-
-
-class _ChangesReward(ConstraintTransform):
-    """Base class of transforms that change `reward`, and keep the environment's own reward."""
-
-    return_key = "task_reward"
-
-    def _keep_reward(self, step: TensorDictBase) -> Tensor:
-        """Return the reward; copy it to `return_key`, unless an earlier transform has done so."""
-        reward = step.get("reward")
-        step.set(self.return_key, step.get(self.return_key, reward))
-        return reward
-
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Add the environment's own reward, and remove the bounds of both rewards."""
-        for key in (self.return_key, "reward"):
-            reward_spec[key] = unbounded_like(reward_spec["reward"])
-        return reward_spec
-
-
-class RewardScale(_ChangesReward):
-    """Multiply the rewards of training by a number.
-
-    Discounted returns should be about 1 to 10: the hidden layers of a critic saturate before its
-    outputs reach the hundreds. Logged returns use the environment's own reward, which is kept in
-    `task_reward`. In evaluation, the reward is not scaled.
-
-    Args:
-        factor: Factor of the rewards.
-
-    Examples:
-        >>> from safe_rl.envs import make_env
-        >>> env = make_env("SafeHopperVelocity", seed=0, transforms={"s": RewardScale(0.01)})
-        >>> step = env.rollout(2)["next"]
-        >>> bool((step["reward"] == 0.01 * step[env.return_key]).all())
-        True
-    """
-
-    def __init__(self, factor: PositiveFloat) -> None:
-        super().__init__()
-        self._factor = factor
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        reward = self._keep_reward(next_tensordict)
-        if not self.evaluating:
-            next_tensordict.set("reward", self._factor * reward)
-        return next_tensordict
 
 
 class EarlyTermination(ConstraintTransform):
@@ -94,11 +48,13 @@ class EarlyTermination(ConstraintTransform):
     """
 
     def __init__(
-        self, budgets: Mapping[str, NonNegativeFloat], in_evaluation: bool = False
+        self,
+        budgets: Annotated[Mapping[str, NonNegativeFloat], MinLen(1)],
+        in_evaluation: bool = False,
     ) -> None:
         super().__init__()
         self.in_evaluation = in_evaluation
-        self.needed_costs = self._budgets = check_budgets(budgets, above_zero=False)
+        self.needed_costs = self._budgets = dict(budgets)
 
     def highest_cost(self, key: str, highest: float, of_a_step: float) -> float:
         """Return the budget plus the highest cost of a step, where episodes terminate by it."""
@@ -123,7 +79,7 @@ class EarlyTermination(ConstraintTransform):
         return next_tensordict
 
 
-class Saute(_ChangesReward):
+class Saute(ConstraintTransform):
     """Observe the share of the budget that is left; once it is spent, the reward is constant.
 
     For each of k costs with a budget d, the share z_t is left after t steps: z_0 = 1 and
@@ -155,16 +111,18 @@ class Saute(_ChangesReward):
         tensor([1., 2.])
     """
 
+    return_key = "task_reward"
+
     def __init__(
         self,
-        budgets: Mapping[str, PositiveFloat],
+        budgets: Budgets,
         *,
         discount: Fraction,
         unsafe_reward: FiniteFloat,
         rescale_budgets: bool,
     ) -> None:
         super().__init__()
-        self.needed_costs = self._budgets = check_budgets(budgets, above_zero=True)
+        self.needed_costs = self._budgets = dict(budgets)
         self._discount = discount
         self._unsafe_reward = unsafe_reward
         self._rescales = rescale_budgets
@@ -199,7 +157,10 @@ class Saute(_ChangesReward):
         costs = costs_of(next_tensordict, self._budgets)
         left = (self._rows[BUDGET] - costs / self._allowed(costs)) / self._discount
         self._rows = {**self._rows, BUDGET: left}
-        reward = self._keep_reward(next_tensordict)
+        reward = next_tensordict.get("reward")
+        # the first transform that changes the reward keeps the environment's own
+        own = next_tensordict.get(self.return_key, reward)
+        next_tensordict.set(self.return_key, own)
         if not self.evaluating:
             spent = (left <= _ROUNDING).any(-1, keepdim=True)
             next_tensordict.set("reward", reward.masked_fill(spent, self._unsafe_reward))
@@ -212,6 +173,12 @@ class Saute(_ChangesReward):
             columns = torch.cat([observation, budget.to(observation.dtype)], -1)
             return next_tensordict.set("observation", columns)
         return next_tensordict.set(("observation", BUDGET), budget.float())
+
+    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+        """Add the environment's own reward, and remove the bounds of both rewards."""
+        for key in (self.return_key, "reward"):
+            reward_spec[key] = unbounded_like(reward_spec["reward"])
+        return reward_spec
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the columns; ValueError for a picture."""
@@ -252,7 +219,7 @@ class Simmer(Saute):
 
     def __init__(
         self,
-        budgets: Mapping[str, PositiveFloat],
+        budgets: Budgets,
         *,
         first: Fraction,
         steps: PositiveInt,

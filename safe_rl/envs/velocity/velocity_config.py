@@ -16,8 +16,15 @@ from typing import Annotated, Any, get_type_hints
 from pydantic import AllowInfNan
 
 from safe_rl.checks import rule
-from safe_rl.envs.errors import ConfigError, on_cpu_only
-from safe_rl.envs.keys import Count, NotNegative, Number, Positive, checked
+from safe_rl.envs.keys import (
+    ConfigError,
+    Count,
+    NotNegative,
+    Number,
+    Positive,
+    checked,
+    on_cpu_only,
+)
 from safe_rl.naming import did_you_mean
 
 PARTS = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
@@ -31,7 +38,7 @@ class Runner:
     Attributes:
         gymnasium_id: The environment with the same dynamics, observation and reward.
         mjcf: The robot's file among Gymnasium's assets.
-        place: The point whose velocity is limited, a key of `locomotion.PLACES`.
+        place: The point whose velocity is limited, a key of `runner.PLACES`.
         num_hidden: Leading positions that `exclude_current_positions_from_observation` hides.
         velocity_limit: Observed joint velocities are clipped to plus and minus this [m/s, rad/s].
         normal_velocities: Whether initial velocities are normally distributed, not uniformly.

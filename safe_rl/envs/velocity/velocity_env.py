@@ -13,17 +13,20 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics.batch import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
-from safe_rl.envs.velocity.locomotion import (
+from safe_rl.envs.velocity.runner import (
     FORCES,
     HEALTH,
     PLACES,
+    Observer,
+    RobotRenderer,
     limited_speed,
+    load_model,
     locomotion_reward,
+    needed_outputs,
 )
-from safe_rl.envs.velocity.runner_model import Observer, RobotRenderer, load_model, needed_outputs
 from safe_rl.envs.velocity.velocity_config import RUNNERS, VelocityConfig, resolve_velocity
 
 _PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
