@@ -157,25 +157,25 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     if any(word.startswith("_") for word in part.split(".")):
         raise TargetError(f"{shown}: what begins with _ is private.")
     try:
-        found = resolve_name(name)
+        target = resolve_name(name)
     except AttributeError as error:
         raise TargetError(
             f"{shown}: {error}.{did_you_mean(error.name or '', dir(error.obj))}"
         ) from None
     except ValueError:
         raise TargetError(f"{shown} is no dotted name.") from None
-    if not (inspect.isclass(found) or inspect.isroutine(found)):
+    if not (inspect.isclass(target) or inspect.isroutine(target)):
         raise TargetError(f"{shown} is neither a class nor a function.")
     # a module may import, and a class inherit, what configurations must not name
-    home = getattr(found, "__module__", None) or ""
+    home = getattr(target, "__module__", None) or ""
     homes = (room for room, names in _ROOMS.items() if room == root or names is None)
     if not any(f"{home}.".startswith(f"{room}.") for room in homes):
         raise TargetError(
             f"{shown}: it is defined in '{home}', which configurations do not reach, not in "
             f"'{root}'. If you trust '{home}', add {quote(f'import={home}')} to the command and "
-            f"write _target_={home}.{found.__qualname__}."
+            f"write _target_={home}.{target.__qualname__}."
         )
-    return found
+    return target
 
 
 def _trusted(node: Any, key: str) -> Any:

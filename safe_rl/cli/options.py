@@ -82,9 +82,9 @@ def make_options(
                 f"Options are: {', '.join(kinds)}."
             )
         OmegaConf.update(read, key, _plain(value), force_add=True)
-    found = OmegaConf.to_container(read)
-    assert isinstance(found, dict)
-    return schema(**{str(k): check_value(str(k), kinds[str(k)], v) for k, v in found.items()})
+    settings = OmegaConf.to_container(read)
+    assert isinstance(settings, dict)
+    return schema(**{str(k): check_value(str(k), kinds[str(k)], v) for k, v in settings.items()})
 
 
 def _is_text(kind: Any) -> bool:

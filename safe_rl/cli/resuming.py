@@ -75,10 +75,10 @@ def _refuse_foreign_cluster(
     config: Mapping[str, Any], words: Sequence[str], directory: Path
 ) -> None:
     """Refuse settings of Ray that come from a file: they can run code, so the user gives them."""
-    said = {word.lstrip("+").partition("=")[0] for word in words}
+    given = {word.lstrip("+").partition("=")[0] for word in words}
     for key, value in flatten({"collector": config.get("collector") or {}}).items():
         is_of_ray = re.match(r"collector\.(ray_init|resources)\.(?!num_[cg]pus$)", key)
-        if is_of_ray and value is not None and key not in said:
+        if is_of_ray and value is not None and key not in given:
             raise ValueError(
                 f"{directory} has {key}. It is not taken from a file, because it could run code: "
                 f"give it again, {key}=…"

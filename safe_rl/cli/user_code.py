@@ -60,10 +60,11 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
         folder = str(Path.cwd() if name == module else path.resolve().parent)
         if folder not in sys.path:
             sys.path.append(folder)
-        found = _import(name, module)
-        if path.is_file() and Path(found).resolve() != path.resolve():
+        loaded_from = _import(name, module)
+        if path.is_file() and Path(loaded_from).resolve() != path.resolve():
             raise ValueError(
-                f"import={module}: Python has another module of that name, {found}. Rename yours."
+                f"import={module}: Python has another module of that name, "
+                f"{loaded_from}. Rename yours."
             )
         trust.allow(name)
         where = module if name == module else str(path.resolve())

@@ -58,15 +58,15 @@ class Certificate:
             head = f"Certified {level} {actions}, all bounds together"
         else:
             head = f"Certified {level} {actions}"
-        said = [self._on(name) for name in verdict.bounds]
+        lines = [self._on(name) for name in verdict.bounds]
         after = f"{checkpoint_steps(self.checkpoint):,} steps, return {self.episode_return:.2f}"
-        if len(said) == 1:
-            found = next(iter(self.means.values()), math.nan)
-            mean = f", mean {found:.3g} in {self.further} further episodes, at {after}"
-            return f"{head}: {said[0]} ({episodes}){mean}. {self._on_rare_episodes()}"
+        if len(lines) == 1:
+            mean_cost = next(iter(self.means.values()), math.nan)
+            mean = f", mean {mean_cost:.3g} in {self.further} further episodes, at {after}"
+            return f"{head}: {lines[0]} ({episodes}){mean}. {self._on_rare_episodes()}"
         rows = [
             f"  {line}, mean {self.means.get(name, math.nan):.3g}"
-            for name, line in zip(verdict.bounds, said, strict=True)
+            for name, line in zip(verdict.bounds, lines, strict=True)
         ]
         head += f" ({episodes}; means of {self.further} further episodes; at {after}):"
         return "\n".join([head, *rows, self._on_rare_episodes()])
@@ -91,17 +91,19 @@ class Certificate:
 
     def _on_rare_episodes(self) -> str:
         """Text on what the bounds do not cover."""
-        said = []
+        sentences = []
         capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
         for name in capped:
             cap, _, key = name.removeprefix("beyond_").partition("_")
-            said.append(
+            sentences.append(
                 f"The mean of {key} is that of costs up to {cap}; {name} is the share of episodes "
                 "that cost more."
             )
         if self.options.bound == "student":
-            said.append("The bound assumes that no rare episodes cost far more than those tested.")
-        if not said:
+            sentences.append(
+                "The bound assumes that no rare episodes cost far more than those tested."
+            )
+        if not sentences:
             most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
-            said.append(f"The bound includes rare episodes that cost up to {most}.")
-        return " ".join([*said, "Not covered: single episodes, other environments."])
+            sentences.append(f"The bound includes rare episodes that cost up to {most}.")
+        return " ".join([*sentences, "Not covered: single episodes, other environments."])

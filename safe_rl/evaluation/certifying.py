@@ -95,12 +95,12 @@ def certify(
         # episodes of the test have decided when it ended: it ends when costs happen to be low
         batch = _BATCH_OF_WARP if _has_warp(trials[chosen]) else _BATCH
         _, (after,) = next(_run([trials[chosen]], seed - _TEST + _AFTER, batch, progress))
-        found = claims[chosen].statements(_costs(after))
+        statements = claims[chosen].statements(_costs(after))
         certificate = replace(
             certificate,
             checkpoint=candidates[chosen],
             episode_return=after.returns.mean().item(),
-            means={one.name: float(one.values.mean()) for one in found},
+            means={item.name: float(item.values.mean()) for item in statements},
             further=len(after.returns),
         )
     certificate = replace(certificate, checkpoint=_keep(run, certificate.checkpoint))
@@ -142,22 +142,23 @@ def _ranked(
     if not together and options.ranking >= 4 / min(_ROUNDS) and len(trials) > options.tests:
         rounds = [int(share * options.ranking) for share in _ROUNDS]
         rounds[-1] = options.ranking - sum(rounds[:-1])
-    found: list[list[Episodes]] = [[] for _ in trials]
+    episodes_of: list[list[Episodes]] = [[] for _ in trials]
     left, given_up = list(range(len(trials))), list[int]()
     for part, number in enumerate(rounds):
         seed = _RANKING + part * _NEXT_BATCH
-        for group in [left] if together else [[one] for one in left]:
-            highest, episodes = next(_run([trials[one] for one in group], seed, number, progress))
-            for one, own in zip(group, episodes, strict=True):
-                found[one].append(own)
+        for group in [left] if together else [[candidate] for candidate in left]:
+            group_trials = [trials[candidate] for candidate in group]
+            highest, episodes = next(_run(group_trials, seed, number, progress))
+            for candidate, batch in zip(group, episodes, strict=True):
+                episodes_of[candidate].append(batch)
         claim = replace(claim, highest=highest)
-        costs = [_costs(*own) for own in found]
-        claims = [claim.with_thresholds(own) for own in costs]
-        returns = [torch.cat([part.returns for part in own]).numpy() for own in found]
+        costs = [_costs(*parts) for parts in episodes_of]
+        claims = [claim.with_thresholds(of_one) for of_one in costs]
+        returns = [torch.cat([part.returns for part in parts]).numpy() for parts in episodes_of]
         order = rank(
-            [returns[one] for one in left],
-            [costs[one] for one in left],
-            [claims[one] for one in left],
+            [returns[candidate] for candidate in left],
+            [costs[candidate] for candidate in left],
+            [claims[candidate] for candidate in left],
         )
         left = [left[place] for place in order]
         kept = max(options.tests, -(-len(left) // 2)) if part + 1 < len(rounds) else len(left)
@@ -195,26 +196,26 @@ def _run(
     several calls have the same layouts. With a batch come the highest possible costs of an episode.
     """
     trial, together = trials[0], len(trials)
-    own, is_fixed = trial.seed, has_fixed_layout(trial.node)  # if fixed, the seed of training
+    run_seed, is_fixed = trial.seed, has_fixed_layout(trial.node)  # if fixed, the seed of training
     most = _BATCH_OF_WARP if _has_warp(trial) else _BATCH
     batch = number if purpose < _TEST else min(number, most)
     worlds = batch if together > 1 else min(number, most)
     keys = list(trial.config.cost_limits)
-    torch.manual_seed(own + purpose)
+    torch.manual_seed(run_seed + purpose)
     with ExitStack() as stack, tqdm(total=number, disable=None if progress else True) as bar:
         for part in range(math.ceil(number / batch)):
             if part == 0 or not is_fixed:
                 stack.close()
-                seed = own if is_fixed else own + purpose + part * _NEXT_BATCH
+                seed = run_seed if is_fixed else run_seed + purpose + part * _NEXT_BATCH
                 changed = replace(trial, options=replace(trial.options, seed=seed))
                 env = stack.enter_context(closing(changed.make(worlds * together)))
                 policy = _side_by_side([each.policy(env) for each in trials])
                 highest = {key: env.highest_cost(key) for key in keys}
-            found = collect_episodes(
+            collected = collect_episodes(
                 env, policy, batch * together, keys, deterministic=trial.options.deterministic
             )
             # sorted by environment, so those of a trial follow each other
-            columns = [found.returns, found.lengths, *found.costs.values()]
+            columns = [collected.returns, collected.lengths, *collected.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)
             yield (
                 highest,

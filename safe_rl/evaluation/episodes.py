@@ -102,11 +102,11 @@ def collect_episodes(
             signals = [after["done"], taken, after[return_key]]
             signals += [after[key] for key in cost_keys]
             # one copy for all of them, because every copy waits for the device
-            found = torch.cat(signals, -1).to(sums)
-            done = found[:, 0].bool()
-            sums += found[:, 1:]
+            read = torch.cat(signals, -1).to(sums)
+            done = read[:, 0].bool()
+            sums += read[:, 1:]
             # of single steps: the sum of an episode can hide one below 0
-            lowest = torch.minimum(lowest, found[:, 2:])
+            lowest = torch.minimum(lowest, read[:, 2:])
             if done.any():
                 steps = torch.where(sums[:, 1:].isfinite(), lowest, sums[:, 1:])
                 columns = zip((return_key, *cost_keys), steps.split(1, -1), strict=True)

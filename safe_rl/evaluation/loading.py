@@ -152,10 +152,10 @@ def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
     target = str(env.get("_target_", "safe_rl."))
     if target.startswith("safe_rl."):
         return
-    own = [key for key in env if key not in ("_target_", "name")]
+    known_keys = [key for key in env if key not in ("_target_", "name")]
     for key in keys:
         if key not in env:
-            known = f"The run has {', '.join(own)}." if own else "The run has none."
+            known = f"The run has {', '.join(known_keys)}." if known_keys else "The run has none."
             raise ValueError(
-                f"env.{key}: {target} has no such key.{did_you_mean(key, own)} {known}"
+                f"env.{key}: {target} has no such key.{did_you_mean(key, known_keys)} {known}"
             )

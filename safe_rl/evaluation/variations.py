@@ -259,14 +259,14 @@ def evaluate_variations(
             if progress:
                 print(f"… {variation}", flush=True)
             trial = Trial(changed, checkpoint, options, make_env)
-            episodes, found = trial.run()
+            episodes, trial_facts = trial.run()
         except ValueError as error:
             if not variation.may_lack:
                 raise
             left_out.append((variation, str(error)))
             continue
-        facts = facts or found
-        estimates = summarise(episodes, found["cost_limits"], None, options.cvar_alpha)
+        facts = facts or trial_facts
+        estimates = summarise(episodes, trial_facts["cost_limits"], None, options.cvar_alpha)
         rows.append(VariedRow(variation, estimates))
     _write(file, rows)
     return Varied(tuple(rows), tuple(left_out), facts, file)
@@ -282,7 +282,7 @@ def _write(path: Path, rows: Sequence[VariedRow]) -> None:
     table: list[list[Any]] = [["variation", "row", "value", "keys", *columns]]
     for variation, estimates in rows:
         changes = " ".join(f"{key}={changed}" for key, changed in variation.keys.items())
-        found = [number for name in names for number in estimates.get(name, ("", "", ""))]
+        numbers = [number for name in names for number in estimates.get(name, ("", "", ""))]
         # a value of None becomes an empty field
-        table.append([str(variation), variation.row, variation.value, changes, *found])
+        table.append([str(variation), variation.row, variation.value, changes, *numbers])
     replace_csv(path, table)

@@ -101,10 +101,10 @@ def check_interface(path: Path, interface: Mapping[str, Any]) -> None:
     known = read_facts(path).get("interface")
     if not isinstance(known, dict):
         return
-    own, sensors = interface["columns"], interface["sensors"]
+    columns, sensors = interface["columns"], interface["sensors"]
     try:
-        if match_columns(known.get("columns"), own, known.get("sensors"), sensors) != [
-            *range(len(own))
+        if match_columns(known.get("columns"), columns, known.get("sensors"), sensors) != [
+            *range(len(columns))
         ]:
             raise ValueError("their order is another one")
     except ValueError as error:

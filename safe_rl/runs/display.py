@@ -163,6 +163,6 @@ def outcome_line(
 
 
 def _final_cost(final: Mapping[str, float], key: str, limit: float | None, measure: str) -> str:
-    mean, own = final[f"episode_{key}"], measured(final, key, limit, measure)
-    differs = abs(own - mean) > 0.05
-    return f"{mean:.1f}" + (f", limited measure {own:.1f}" if differs else "")
+    mean, limited = final[f"episode_{key}"], measured(final, key, limit, measure)
+    differs = abs(limited - mean) > 0.05
+    return f"{mean:.1f}" + (f", limited measure {limited:.1f}" if differs else "")

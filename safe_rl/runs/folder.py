@@ -56,8 +56,8 @@ def checkpoint_steps(path: Path) -> int | None:
 
 def checkpoints_in(directory: Path) -> list[Path]:
     """Checkpoints in a folder by ascending steps, readable or not; none if there is no folder."""
-    found = directory.iterdir() if directory.is_dir() else ()
-    return sorted(path for path in found if checkpoint_steps(path) is not None)
+    entries = directory.iterdir() if directory.is_dir() else ()
+    return sorted(path for path in entries if checkpoint_steps(path) is not None)
 
 
 def run_of(source: Path) -> tuple[Path, int | None]:

@@ -30,8 +30,8 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
         >>> violation({"episode_cost": 30.0, "violation_cost": 62.0}, "cost", 25.0)
         62.0
     """
-    own = row.get(f"violation_{key}", math.nan)
-    return row[f"episode_{key}"] - limit if math.isnan(own) else own
+    written = row.get(f"violation_{key}", math.nan)
+    return row[f"episode_{key}"] - limit if math.isnan(written) else written
 
 
 def measured(row: Mapping[str, float], key: str, limit: float | None, measure: str) -> float:

@@ -136,18 +136,18 @@ class Run:
             return self._certified()
 
         # the newest one, even if it cannot be read: an older one must not silently replace it
-        found = {kind: self.newest_checkpoint(kind) for kind in KINDS}
-        found["best"] = best_checkpoint(self.checkpoints_folder / "best")
-        path = found[which]
+        newest = {kind: self.newest_checkpoint(kind) for kind in KINDS}
+        newest["best"] = best_checkpoint(self.checkpoints_folder / "best")
+        path = newest[which]
         if which == "last" and not self.has_begun:  # only a policy, see `pack_policy`
-            path = path or found["certified"]
+            path = path or newest["certified"]
         if path is None:
             reason = {
                 "last": "it has not saved one yet",
                 "best": "no epoch kept every cost limit",
                 "certified": "none of its policies has been certified",
             }
-            other = next((kind for kind, other in found.items() if other is not None), None)
+            other = next((kind for kind, other in newest.items() if other is not None), None)
             hint = f" Use checkpoint={other}." if other else ""
             raise FileNotFoundError(
                 f"{self.directory} has no {which} checkpoint: {reason[which]}.{hint}"
@@ -272,8 +272,8 @@ class Run:
     @property
     def episode_length(self) -> int | None:
         """T_ep in steps, or None if the configuration does not have it."""
-        found = (self.settings["env"].get(key) for key in ("num_steps", "max_episode_steps"))
-        return next((n for n in found if type(n) is int and n > 0), None)
+        lengths = (self.settings["env"].get(key) for key in ("num_steps", "max_episode_steps"))
+        return next((n for n in lengths if type(n) is int and n > 0), None)
 
     @cached_property
     def overrides(self) -> list[str] | None:

@@ -219,12 +219,12 @@ def commit_of(file: Path) -> tuple[str | None, bool | None]:
         (None, None)
     """
     known = _git(file.parent, "ls-files", "--error-unmatch", file.name)
-    said = known and _git(
+    description = known and _git(
         file.parent, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty"
     )
-    if not said:
+    if not description:
         return None, None
-    return said.removesuffix("-dirty"), said.endswith("-dirty")
+    return description.removesuffix("-dirty"), description.endswith("-dirty")
 
 
 def _git(directory: Path, *arguments: str) -> str:

@@ -90,10 +90,10 @@ class Suite:
         standard = self.environments.get(name) if isinstance(name, str) else None
         if standard is None:
             return None
-        own = {**self.defaults, **node}
-        keys = dict.fromkeys([*standard, *own])
-        differ = [key for key in keys if own.get(key, ...) != standard.get(key, ...)]
-        return {key: own.get(key) for key in differ if key != "name"}
+        complete = {**self.defaults, **node}
+        keys = dict.fromkeys([*standard, *complete])
+        differ = [key for key in keys if complete.get(key, ...) != standard.get(key, ...)]
+        return {key: complete.get(key) for key in differ if key != "name"}
 
     def name_of(self, node: Node, *, but_for: Collection[str] = ()) -> str | None:
         """Name of the environment that a configuration equals, ignoring keys `but_for`; or None."""

@@ -126,7 +126,7 @@ class Candidates(Resumable):
 
         They keep waiting, because a resumed run has later epochs to judge them by.
         """
-        return [one for policy in self.waiting for one in self._judge(policy)]
+        return [judged for policy in self.waiting for judged in self._judge(policy)]
 
     def _judge(self, policy: Mapping[str, Any]) -> list[Judged]:
         score = feasible_return(self._latest, self._limits)

@@ -279,5 +279,6 @@ class Trainer:
 
     def _keep(self, judged: Iterable[Judged]) -> None:
         """Save checkpoints of the judged policies that are among the best so far."""
-        for one in judged:
-            self._checkpoints.save_best(one.steps, one.score, one.facts, states=one.states)
+        for policy in judged:
+            steps, score, facts, states = policy
+            self._checkpoints.save_best(steps, score, facts, states=states)
