@@ -53,7 +53,7 @@ class Certificate:
             )
             return line + self._on_fewest()
         if set(verdict.by_construction) == set(verdict.bounds):
-            head = f"Kept by construction {actions}: no episode can cost more"
+            head = f"Limit kept {actions}"
         elif len(verdict.bounds) > 1:
             head = f"Certified {level} {actions}, all bounds together"
         else:

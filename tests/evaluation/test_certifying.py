@@ -366,7 +366,7 @@ def test_several_bounds_are_a_table_and_what_holds_by_construction_is_said():
     assert last.startswith("The bound includes rare")
     alone = replace(verdict, bounds={"mean_fast": (2.0, 2.0)})
     said = str(Certificate(CHECKPOINT, 3.0, alone, OPTIONS, {"mean_fast": 1.5}, 100))
-    assert said.startswith("Kept by construction with sampled actions: no episode can cost more: ")
+    assert said.startswith("Limit kept with sampled actions: mean_fast ≤ 2 by construction, ")
     assert "ertified" not in said
 
 
