@@ -108,12 +108,17 @@ class OffPolicy(Resumable, Algorithm):
         )
         update = instantiate(config.policy_update, loss=loss)
         _check_loss(config, constraints, loss)
+        cost_gamma = config.loss.get("cost_gamma")
+        others = (
+            {} if cost_gamma is None else {"gammas": dict.fromkeys(constraints.keys, cost_gamma)}
+        )
         buffer = instantiate(
             config.memory,
             in_keys=loss.in_keys,
             reward_keys=["reward", *constraints.keys],
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
+            **others,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0

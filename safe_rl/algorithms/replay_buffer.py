@@ -40,6 +40,7 @@ class Memory(Checked):
         in_keys: Entries of a step that are stored.
         reward_keys: Entries below ``next`` that are summed over n steps.
         reward_gamma: Discount per step of these sums.
+        gammas: Discounts of some of them, which replace ``reward_gamma``, by entry.
         n_steps: Number n of steps that a transition spans (n-step returns).
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
@@ -73,6 +74,7 @@ class Memory(Checked):
         in_keys: Sequence[NestedKey],
         reward_keys: Sequence[NestedKey],
         reward_gamma: float,
+        gammas: Mapping[NestedKey, float] | None = None,
         n_steps: Annotated[int, Interval(ge=1, le=1000)],
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
@@ -85,13 +87,15 @@ class Memory(Checked):
             storage=LazyTensorStorage(capacity, device=self._device),
             sampler=_sampler(capacity, prioritised),
         )
-        self._multi_step: MultiStepTransform | None = None
-        if n_steps > 1:
-            # its default done_keys keep `terminated` of the first step, so that values would be
-            # bootstrapped beyond an end within the n steps
-            self._multi_step = MultiStepTransform(
-                n_steps, reward_gamma, reward_keys=list(reward_keys), done_keys=[]
-            )
+        keys_of: dict[float, list[NestedKey]] = {}
+        for key in reward_keys if n_steps > 1 else ():
+            keys_of.setdefault((gammas or {}).get(key, reward_gamma), []).append(key)
+        # its default done_keys keep `terminated` of the first step, so that values would be
+        # bootstrapped beyond an end within the n steps
+        self._sums = [
+            MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
+            for gamma, keys in keys_of.items()
+        ]
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -99,34 +103,49 @@ class Memory(Checked):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the steps [N, T] that follow those of the last call."""
-        self._add([batch] if self._multi_step is None else self._summed(batch, self._multi_step))
+        self._add(self._summed(batch) if self._sums else [batch])
 
     def _add(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
             return
-        spanned = [] if self._multi_step is None else ["steps_to_next_obs"]
+        spanned = ["steps_to_next_obs"] if self._sums else []
         pieces = [piece.select(*self.in_keys, *spanned) for piece in pieces]
         steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
         self._buffer.extend(steps.reshape(-1))
 
-    def _summed(self, batch: TensorDictBase, transform: MultiStepTransform) -> list[TensorDictBase]:
-        """Transitions over n steps, piece by piece; the transform remembers earlier steps."""
+    def _summed(self, batch: TensorDictBase) -> list[TensorDictBase]:
+        """Transitions over n steps, piece by piece; the transforms remember earlier steps."""
         wanted = batch.select(*{("next", "done"), *self.in_keys})
-        found = [transform.inv(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
+        found = [self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
         return [piece for piece in found if piece is not None]
+
+    def _over_steps(self, piece: TensorDictBase) -> TensorDictBase | None:
+        """Transitions over n steps; None if there are fewer than n steps so far."""
+        first, *others = self._sums
+        found: TensorDictBase | None = first.inv(piece)
+        for transform in others:
+            sums = transform.inv(piece.select(*_read_by(transform)))
+            if found is not None:
+                found["next"].update(sums["next"].select(*transform.reward_keys))
+        return found
 
     def end_rows(self) -> None:
         """Complete the sums over n steps, because the next batch does not follow the last one."""
-        transform = self._multi_step
         # TorchRL has no public access to the steps whose sums are not complete
-        if transform is None or transform._buffer is None:
+        if not self._sums or self._sums[0]._buffer is None:
             return
-        waiting = transform._buffer.clone()
+        waiting = self._sums[0]._buffer.clone()
         waiting["next", "done"][..., -1, :] = True
-        transform._buffer = waiting
-        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], transform.n_steps)
-        self._add([transform.inv(beyond)])
-        transform._buffer = None
+        self._wait_with(waiting)
+        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._sums[0].n_steps)
+        self._add([piece for piece in [self._over_steps(beyond)] if piece is not None])
+        self._wait_with(None)
+
+    def _wait_with(self, steps: TensorDictBase | None) -> None:
+        """Set the last steps, whose sums are not complete."""
+        for number, transform in enumerate(self._sums):
+            kept = steps if steps is None or not number else steps.select(*_read_by(transform))
+            transform._buffer = kept
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
         """Draw a number of minibatches.
@@ -155,7 +174,7 @@ class Memory(Checked):
             # of a view, torch would save the whole underlying storage
             steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
-        tail = None if self._multi_step is None else self._multi_step._buffer
+        tail = self._sums[0]._buffer if self._sums else None
         if tail is not None:
             state["tail"] = tail.clone().flatten_keys("/").to_dict()
             state["tail_shape"] = list(tail.batch_size)
@@ -171,12 +190,16 @@ class Memory(Checked):
         self._buffer.writer.load_state_dict(state_dict["writer"])
         if self.is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
-        if self._multi_step is not None:
-            self._multi_step._buffer = None
-            if "tail" in state_dict:
-                # the saved run may have used another device
-                tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
-                self._multi_step._buffer = tail.unflatten_keys("/")
+        self._wait_with(None)
+        if self._sums and "tail" in state_dict:
+            # the saved run may have used another device
+            tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
+            self._wait_with(tail.unflatten_keys("/"))
+
+
+def _read_by(transform: MultiStepTransform) -> list[NestedKey]:
+    """Entries of steps from which sums are computed."""
+    return [("next", key) for key in ("done", *transform.reward_keys)]
 
 
 def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:

@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from safe_rl.checks import Share
 from safe_rl.objectives.cost_values import CostValues, MeanCosts
 from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.limits import LimitState
@@ -40,6 +41,7 @@ class CostCritics(QFunctionLoss):
         multiplier: λ; read at every call. It is not part of the loss or its ``state_dict``.
         cost_keys: Keys of the costs below ``next``, [..., 1] each. Transitions over n steps need
             discounted sums of costs: name the costs in ``reward_keys`` of `MultiStepTransform`.
+        cost_gamma: Discount per step of the costs; None: that of the reward.
         cost_values: What the outputs of a critic mean; by default `MeanCosts`.
         pessimism: Number κ of standard deviations among the cost critics that is added to their
             mean in the actor's loss.
@@ -75,6 +77,7 @@ class CostCritics(QFunctionLoss):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
+        cost_gamma: Share | None = None,
         cost_values: CostValues | None = None,
         pessimism: FiniteFloat = 0.0,
         target_pessimism: FiniteFloat | None = None,
@@ -101,6 +104,7 @@ class CostCritics(QFunctionLoss):
         self.out_keys = [
             *self.out_keys, "loss_cost_qvalue", "cost_qvalue", *self.cost_values.columns
         ]  # fmt: skip
+        self._cost_gamma = cost_gamma
         self.pessimism, self.target_pessimism = pessimism, target_pessimism
         self.lowest_cost_value = lowest_cost_value
         # not a part of the loss: its owner saves it
@@ -114,6 +118,11 @@ class CostCritics(QFunctionLoss):
         super()._set_in_keys()
         following = (("next", key) for key in (*self._read, *self.cost_keys))
         self._in_keys = list(dict.fromkeys([*self._in_keys, *self._read, *following]))
+
+    @property
+    def cost_gamma(self) -> float:
+        """Discount per step of the costs."""
+        return self.gamma if self._cost_gamma is None else self._cost_gamma
 
     def values_of_costs(
         self,
@@ -134,7 +143,7 @@ class CostCritics(QFunctionLoss):
         values = self.values_of_costs(steps, steps.get(keys.action))
         costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
         ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
-        return critic_bias(self.cost_values.mean(values).mean(0), costs, *ends, self.gamma)
+        return critic_bias(self.cost_values.mean(values).mean(0), costs, *ends, self.cost_gamma)
 
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
@@ -157,7 +166,7 @@ class CostCritics(QFunctionLoss):
             values = self.values_of_costs(following, next_action, "target")
             ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
-            discount = discount_of(tensordict, self.gamma, spanned) * ends.logical_not()
+            discount = discount_of(tensordict, self.cost_gamma, spanned) * ends.logical_not()
         found = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
         loss = self.cost_errors(found, costs, discount, values).sum(-1).sum(0)
         return self._mean(loss, tensordict)

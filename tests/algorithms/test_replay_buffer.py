@@ -94,6 +94,26 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         assert step["next", "terminated"].item() is (reaches_the_end and terminates)
 
 
+def test_sums_may_have_discounts_of_their_own():
+    plain, own, copy = (
+        make_memory(n_steps=3),
+        *(make_memory(n_steps=3, gammas={"cost": 0.9}) for _ in range(2)),
+    )
+    for first in range(0, 12, 4):
+        copy.load_state_dict(own.state_dict())
+        for memory in (plain, own, copy):
+            memory.extend(make_batch(first, 4, ends=[5]))
+    for memory in (plain, own, copy):
+        memory.end_rows()
+    for observation, step in all_of(plain).items():
+        for other in (all_of(own)[observation], all_of(copy)[observation]):
+            time, length = observation % 1000, int(step["steps_to_next_obs"])
+            cost = sum(0.9**i * (100 + time + i) for i in range(length))
+            assert other["next", "cost"].item() == pytest.approx(cost)
+            assert torch.equal(other["next", "reward"], step["next", "reward"])
+            assert torch.equal(other["next", "observation"], step["next", "observation"])
+
+
 def check_draws(memory, copy, batch):
     """Both give the same minibatches after another batch."""
     drawn = []

@@ -63,13 +63,11 @@ def make_loss(kind, multiplier=None, networks=2, **keys):
         "td3": (make_bounded_actor, TD3, TD3Loss, TD3LagrangianLoss),
         "cal": (make_squashed_actor, CAL, SACLoss, CALLoss),
     }[kind]
-    actor = make_own(3, *BOUNDS, hidden_sizes=[8])
+    settings, actor = settings | keys, make_own(3, *BOUNDS, hidden_sizes=[8])
     if multiplier is None:
-        return plain(actor, make_q(), **settings, **keys)
+        return plain(actor, make_q(), **settings)
     cost_q = make_q(networks, num_outputs=2, out_key="cost_value")
-    loss = constrained(
-        actor, make_q(), cost_q, multiplier=multiplier, cost_keys=COSTS, **settings, **keys
-    )
+    loss = constrained(actor, make_q(), cost_q, multiplier=multiplier, cost_keys=COSTS, **settings)
     return told(loss, [1.0, 1.0])
 
 
@@ -223,6 +221,24 @@ def test_td3_learns_costs_for_actions_with_noise_that_is_cut_within_their_bounds
     sides = torch.stack([(without + change).clamp(-1, 1) for change in (-clip, clip)])
     assert (given[0] == sides).any(0).all()
     assert (without.abs() < 0.5).all()  # so that one of the two is cut by the bounds
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_costs_may_have_a_discount_of_their_own(kind):
+    steps, found = make_steps(), {}
+    steps["steps_to_next_obs"] = torch.arange(1, 7).unsqueeze(-1)
+    for gammas in ((0.9, 0.5), (0.9, None), (0.5, None)):
+        torch.manual_seed(0)
+        keys = {"gamma": gammas[0], "cost_gamma": gammas[1]}
+        loss = make_loss(kind, lagrange(1.0, 1.0), **keys)
+        torch.manual_seed(1)
+        bias = loss.cost_bias(steps.unflatten(0, (2, 3)))
+        found[gammas] = loss.critic_losses(steps.clone()).set("bias", bias)
+    own, reward, cost = found.values()
+    assert own["loss_qvalue"] == reward["loss_qvalue"] != cost["loss_qvalue"]
+    for name in ("loss_cost_qvalue", "bias"):
+        assert torch.equal(own[name], cost[name])
+        assert not torch.equal(own[name], reward[name])
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
