@@ -185,9 +185,9 @@ def _has_warp(trial: Trial) -> bool:
 
 
 def _run(
-    trials: list[Trial], purpose: int, number: int, progress: bool
+    trials: list[Trial], seed_offset: int, number: int, progress: bool
 ) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
-    """Batches of episodes with seeds that neither training nor another purpose uses, per trial.
+    """Batches of episodes with seeds that neither training nor another use has, per trial.
 
     A round of the ranking is one batch. In a batch of a test every environment has one episode, so
     short episodes do not count before long ones. Every batch has new instances of the environment:
@@ -198,15 +198,15 @@ def _run(
     trial, together = trials[0], len(trials)
     run_seed, is_fixed = trial.seed, has_fixed_layout(trial.node)  # if fixed, the seed of training
     most = _BATCH_OF_WARP if _has_warp(trial) else _BATCH
-    batch = number if purpose < _TEST else min(number, most)
+    batch = number if seed_offset < _TEST else min(number, most)
     worlds = batch if together > 1 else min(number, most)
     keys = list(trial.config.cost_limits)
-    torch.manual_seed(run_seed + purpose)
+    torch.manual_seed(run_seed + seed_offset)
     with ExitStack() as stack, tqdm(total=number, disable=None if progress else True) as bar:
         for part in range(math.ceil(number / batch)):
             if part == 0 or not is_fixed:
                 stack.close()
-                seed = run_seed if is_fixed else run_seed + purpose + part * _NEXT_BATCH
+                seed = run_seed if is_fixed else run_seed + seed_offset + part * _NEXT_BATCH
                 changed = replace(trial, options=replace(trial.options, seed=seed))
                 env = stack.enter_context(closing(changed.make(worlds * together)))
                 policy = _side_by_side([each.policy(env) for each in trials])

@@ -225,7 +225,7 @@ class LimitTracker(Checked, Resumable):
         (tensor([65.]), tensor([45.]))
     """
 
-    state_names = (*("costs", "predictions", "_steps", "_reached", "_noise", "_integral"),)
+    state_names = ("costs", "predictions", "_steps", "_reached", "_noise", "_integral")
 
     def __init__(
         self,

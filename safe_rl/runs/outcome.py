@@ -15,7 +15,7 @@ FINAL_EPOCHS = 5
 """Epochs over which the final J_r and J_c are averaged (Ray et al. 2019, section 5.1)."""
 
 FINAL_STEPS = 100_000
-"""Steps to average over at least: five epochs of SAC have 25 episodes, five of PPO a hundred."""
+"""Steps that the averaged epochs cover, if the run is long: five epochs of SAC have 25 episodes."""
 
 
 def violation(row: Mapping[str, float], key: str, limit: float) -> float:
@@ -108,7 +108,7 @@ def final_width(steps: Iterable[float]) -> int:
     """
     ends = list(steps)
     last = max(ends, default=0)
-    begin = last - min(FINAL_STEPS, last / FINAL_EPOCHS)
+    begin = last - min(FINAL_STEPS, last / 5)
     return max(FINAL_EPOCHS, sum(end > begin for end in ends))
 
 
