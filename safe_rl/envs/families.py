@@ -10,6 +10,7 @@ the user permits it by `import=`.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from importlib import import_module
@@ -186,17 +187,10 @@ def env_node(env: str | SafetyGymConfig | VelocityConfig, name: str = "") -> dic
                 "(store_config), import the module first."
             )
         return env_node(resolve(env), env)
-    name = name or "custom"
-    if isinstance(env, VelocityConfig):
-        return {"name": name, "_target_": VELOCITY_TARGET, **_lists(env.to_dict())}
-    return {"name": name, **_lists(resolve(env).to_dict())}
-
-
-def _lists(value: Any) -> Any:
-    """Turn tuples into lists, because Hydra has no tuples."""
-    if isinstance(value, Mapping):
-        return {key: _lists(item) for key, item in value.items()}
-    return [_lists(item) for item in value] if isinstance(value, tuple) else value
+    config = env if isinstance(env, VelocityConfig) else resolve(env)
+    target = {"_target_": VELOCITY_TARGET} if isinstance(env, VelocityConfig) else {}
+    # lists instead of tuples, which Hydra does not have
+    return {"name": name or "custom", **target, **json.loads(json.dumps(config.to_dict()))}
 
 
 def complete_env(node: Mapping[str, Any]) -> dict[str, Any]:
@@ -256,7 +250,6 @@ def store_configs(whole: Container[str] | None = None) -> None:
         whole: Names of those that have their keys; None: all. Of the others only the names can be
             listed. Hydra copies its store once per configuration group to print its help.
     """
-    text = {"name": Key(SAFETY_GYM, Text)}
     nodes: dict[str, Any] = {}
     for name, keys in (SUITE | EXTRAS | _STORED).items():
         base = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
@@ -271,7 +264,8 @@ def store_configs(whole: Container[str] | None = None) -> None:
         nodes[name] = structured(name, rows)
     if whole is not None:
         nodes = {name: node if name in whole else {} for name, node in nodes.items()}
-    for name, node in {SAFETY_GYM: structured("SafetyGym", text | KEYS), **nodes}.items():
+    nodes[SAFETY_GYM] = structured("SafetyGym", {"name": Key(SAFETY_GYM, Text)} | KEYS)
+    for name, node in nodes.items():
         ConfigStore.instance().store(name, node, GROUP)
 
 
@@ -310,7 +304,6 @@ def make_env(
         >>> make_env({"name": "mine", "robot_base": "point"}, num_envs=2).batch_size
         torch.Size([2])
     """
-    # imported here, because environments need torch and their names do not
     from safe_rl.envs.contract import ContractError, check_constrained_env
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.transforms import transform_env
@@ -323,7 +316,7 @@ def make_env(
     node |= keys
     target = node.pop("_target_", None)
     node.pop("name", None)
-    build = SafetyGymEnv if target is None else locate(target, key="env._target_")
+    build: Any = SafetyGymEnv if target is None else locate(target, key="env._target_")
     try:
         signature(build).bind(node, **given)
     except TypeError as error:

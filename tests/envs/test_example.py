@@ -4,7 +4,6 @@ import runpy
 from types import SimpleNamespace
 
 import pytest
-import torch
 from commands import ROOT, in_a_process
 
 from safe_rl.envs import SafetyGymEnv
@@ -39,14 +38,6 @@ def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
         in_a_process(*command, IMPORT)
     assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
     assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
-
-
-def test_danger_rises_towards_the_centre(example):
-    robot = torch.tensor([[0.0, 0.0]])
-    mines = torch.tensor([[[0.1, 0.0], [0.0, 0.3]]])
-    torch.testing.assert_close(example.danger(robot, mines, 0.2), torch.tensor([0.5]))
-    torch.testing.assert_close(example.danger(robot, mines, 0.4), torch.tensor([0.75]))
-    torch.testing.assert_close(example.danger(robot, mines, 0.05), torch.tensor([0.0]))
 
 
 def test_robots_meet_its_mines(example):

@@ -53,21 +53,6 @@ def test_areas_are_placed_seen_and_cost():
     check_env_specs(env)
 
 
-def test_layouts_keep_clear_of_registered_objects():
-    register_mines()
-    config = {**MINES, "mines_num": 6, "mines_placements": [[0, -2, 2, 2]], "hazards_num": 3}
-    env = make({**config, "task": "goal"}, num_envs=200)
-    layout = env.get_state()["layout"]
-    names = ["robot", *env.object_names]
-    keepout = {"robot": 0.4, "goal": 0.4, "hazard": 0.4, "mine": 0.3}
-    keepouts = torch.tensor([keepout[name.rstrip("0123456789")] for name in names])
-    distance = torch.cdist(layout, layout) + 1e3 * torch.eye(len(names))
-    assert (distance >= keepouts + keepouts.unsqueeze(1) - 1e-9).all()
-    mines = layout[:, [i for i, name in enumerate(names) if name.startswith("mine")]]
-    assert 0.3 <= float(mines[..., 0].min()) < 0.4
-    assert 1.6 < float(mines[..., 0].max()) <= 1.7
-
-
 def test_static_bodies_stop_the_robot_and_contacts_can_cost():
     register_element(cube("bollards", "bollard", Motion.STATIC))
     cost = Cost(

@@ -16,7 +16,6 @@ from safe_rl.envs import (
     SUITE,
     ConfigError,
     SafetyGymConfig,
-    SafetyGymEnv,
     env_node,
     make_env,
 )
@@ -104,25 +103,6 @@ def test_any_configuration_can_be_made():
     ):
         with pytest.raises((ConfigError, TypeError, ValueError), match=told):
             gymnasium.make(f"{name}-v0", disable_env_checker=True, **given)
-
-
-@needs_opengl
-def test_frames_are_what_the_camera_sees():
-    make = {"render_mode": "rgb_array", "camera": "track", "width": 64, "height": 48}
-    env = gymnasium.make("Safexp-PointGoal1-v0", **make)
-    env.reset(seed=4)
-    batch = SafetyGymEnv("PointGoal1", seed=4)
-    batch.reset()
-    expected = batch.render(0, camera="track", width=64, height=48)
-    np.testing.assert_array_equal(env.render(), expected)
-    envs = gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=2, **make)
-    envs.reset(seed=4)
-    frames = envs.render()
-    assert len(frames) == 2
-    np.testing.assert_array_equal(frames[0], expected)
-    with pytest.warns(UserWarning, match="HumanRendering"):
-        shown = gymnasium.make("Safexp-PointGoal1-v0", **{**make, "render_mode": "human"})
-    assert isinstance(shown, gymnasium.wrappers.HumanRendering)
 
 
 def test_specs_say_how_long_episodes_are_and_time_is_up_once():

@@ -69,13 +69,6 @@ def test_a_state_has_what_it_remembers():
     env.set_state(state.exclude("cost_traces"))  # as in a state from before
 
 
-def test_transforms_pass_it_on():
-    slow = {"_target_": "safe_rl.envs.transforms.ActionRepeat", "k": 2}
-    env = make(transforms={"slow": slow})
-    assert env.privileged_layout
-    assert "privileged" in env.rollout(3)["next"]
-
-
 class Hidden(Walk):
     """Observes a place, and has a wind that critics may know."""
 

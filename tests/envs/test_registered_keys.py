@@ -10,7 +10,6 @@ from omegaconf import OmegaConf
 from registrations import POINT, disc, register_mines
 from run_configs import CONF
 
-from safe_rl.checks import Share
 from safe_rl.envs import (
     ConfigError,
     SafetyGymConfig,
@@ -22,7 +21,6 @@ from safe_rl.envs import (
 )
 from safe_rl.envs.extending import (
     Cost,
-    Key,
     NextGoal,
     Reading,
     Task,
@@ -105,17 +103,3 @@ def test_names_that_meet_an_observation_are_refused():
     register_observation(Reading("gyro", (), lambda c, s: 1, lambda w: w.up[:, None]))
     with pytest.raises(ConfigError, match=r"Two observations.*'gyro'"):
         SafetyGymEnv(POINT)
-
-
-def test_keys_of_any_type():
-    fuse, colours = Key(None, Share | None), Key((), tuple[str, ...])
-    keys = {"mines_fuse": fuse, "mines_colours": colours, "mines_times": (1.0, 2), "mines_on": True}
-    register_element(disc("mines", "mine"), keys=keys)
-    config = SafetyGymConfig(mines_colours=["red"])
-    assert (config.mines_fuse, config.mines_colours) == (None, ("red",))
-    assert (config.mines_times, config.mines_on) == ((1.0, 2.0), True)
-    assert config.replace(mines_fuse=1).mines_fuse == 1.0
-    with pytest.raises(ConfigError, match="mines_fuse=2: it must be less"):
-        config.replace(mines_fuse=2)
-    with pytest.raises(ConfigError, match="mines_on=1"):
-        config.replace(mines_on=1)

@@ -11,7 +11,7 @@ from commands import in_a_process
 from pictures import colour_at, from_above, likeness, make_env, needs_opengl, redness
 
 import safe_rl.envs
-from safe_rl.envs import OpenGLError, SafetyGymEnv
+from safe_rl.envs import OpenGLError
 from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
@@ -80,18 +80,6 @@ def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
 
 
 @needs_opengl
-def test_rows_are_drawn_apart():
-    env = SafetyGymEnv("PointGoal1", num_envs=3, seed=0)
-    env.reset()
-    frames = env.render(width=60, height=40)
-    assert frames.shape == (3, 40, 60, 3)
-    assert frames.dtype == np.uint8
-    assert (frames[0] != frames[1]).any()
-    np.testing.assert_array_equal(env.render(2, width=60, height=40), frames[2])
-    np.testing.assert_array_equal(env.render([2, 0], width=60, height=40), frames[[2, 0]])
-
-
-@needs_opengl
 @pytest.mark.parametrize("name", ["CarPush2", "SafeAntVelocity"])
 def test_drawing_changes_nothing(name):
     states = []
@@ -109,7 +97,7 @@ def test_drawing_changes_nothing(name):
 
 @needs_opengl
 @pytest.mark.parametrize("lidar_type", ["pseudo", "natural"])
-@pytest.mark.parametrize(("bearing", "yaw"), [(0.2, 0.0), (1.9, 0.0), (1.9, 2.5), (-2.0, 1.0)])
+@pytest.mark.parametrize(("bearing", "yaw"), [(0.2, 0.0), (1.9, 2.5)])
 def test_halos_are_lit_towards_the_object(bearing, yaw, lidar_type):
     pillar = (1.5 * math.cos(bearing), 1.5 * math.sin(bearing))
     config = {
@@ -143,30 +131,6 @@ def test_a_red_sphere_is_shown_while_a_cost_is_incurred():
     assert redness(colour_at(env, *beside)) < 0.1
 
 
-@needs_opengl
-def test_the_goal_button_stands_in_a_grey_cylinder():
-    places = [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)]
-    env = make_env({"task": "button", "buttons_num": 3, "buttons_locations": places})
-    goal = int(env.get_state()["goal_button"])
-    for button, (x, y) in enumerate(places):
-        # Squares of the floor differ: compare with the same square, outside of the cylinder.
-        beside, outside = colour_at(env, x + 0.16, y + 0.02), colour_at(env, x + 0.25, y + 0.02)
-        assert np.ptp(beside) < 0.05
-        assert (beside.mean() < outside.mean() - 0.03) == (button == goal)
-
-
-@needs_opengl
-def test_the_tracking_camera_is_behind_the_robot_and_level():
-    ahead = {"task": "goal", "goal_locations": [(-0.5, 1.5)]}
-    env = make_env(ahead, robot_rot=math.atan2(1.5, -0.5), render_lidar_markers=False)
-    frame = env.render(0, camera="track", width=100, height=100).astype(float)
-    assert redness(frame[50, 50] / 255) > 0.3
-    green = frame[..., 1] - frame[..., [0, 2]].max(-1) > 20
-    y, x = np.argwhere(green).mean(0)
-    assert y < 40
-    assert abs(x - 50) < 3
-
-
 def is_skin(frame):
     """Where the robots' brown is."""
     red, _, blue = (frame[..., part].astype(int) for part in range(3))
@@ -195,20 +159,6 @@ def test_cameras_move_with_the_robot(name, camera):
     lines, columns = is_skin(far).nonzero()
     assert 32 < columns.mean() < 96
     assert 24 < lines.mean() < 80
-
-
-@needs_opengl
-def test_too_fast_robots_are_marked():
-    keys = {"robot": "half_cheetah", "velocity_threshold": 1.0}
-    env = VelocityEnv(keys, num_envs=2, seed=0, num_threads=1)
-    env.reset()
-    state = env.get_state()
-    state["qvel"][:, 0] = torch.tensor([0.0, 5.0])
-    env.set_state(state)
-    env.step(env.full_action_spec.zero())
-    marked = [(redness(frame.astype(int)) > 60).sum() for frame in env.render(width=64, height=48)]
-    assert marked[0] < 5
-    assert marked[1] > 50
 
 
 @pytest.mark.parametrize(("backend", "package"), [("egl", "libegl1"), ("osmesa", "libosmesa6")])

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from crafting import arrange, make, step_from
@@ -135,14 +134,3 @@ def test_every_row_keeps_its_specs_and_lasts_500_steps(name):
     assert xy.abs().max() <= half + 1e-6
     expected = {"cost", "cost_boundary", "cost_exception"}
     assert set(env.cost_keys) == expected | ({"cost_velocity"} if "Run" in name else set())
-
-
-def test_boundaries_are_drawn_where_they_are():
-    narrow, wide = (begin("PointRun1", boundary_y=half) for half in (0.3, 0.9))
-    pictures = [env.render(0, camera="fixedfar", width=120, height=90) for env in (narrow, wide)]
-    free = begin("PointRun", robot_placements=((-0.2, -0.2, 0.2, 0.2),), robot_keepout=0.0)
-    free.set_state(narrow.get_state())
-    plain = free.render(0, camera="fixedfar", width=120, height=90)
-    assert (pictures[0] != plain).any()
-    lines = [np.flatnonzero((p.astype(int) - plain).any((1, 2))) for p in pictures]
-    assert np.ptp(lines[0]) < np.ptp(lines[1])

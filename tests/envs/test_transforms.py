@@ -8,7 +8,7 @@ from point_mass import PointMass
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.envs.utils import check_env_specs
-from transforming import ENVIRONMENTS, SAUTE, TRANSFORMS, Priced, half_speed, still, transformed
+from transforming import ENVIRONMENTS, SAUTE, TRANSFORMS, Priced, still, transformed
 
 from safe_rl.envs import ConfigError, ConstrainedEnv, check_constrained_env, make_env
 from safe_rl.envs.transforms import (
@@ -128,16 +128,6 @@ def test_the_budget_of_simmer_grows_from_episode_to_episode():
     assert solved.reset()["observation"][0, -1].item() == 1.0
 
 
-def test_the_schedule_continues_where_workers_take_it_up():
-    env = transformed(Priced([[0.5] * 4, [0.5] * 4]), "simmer")
-    start = env.reset()
-    env.continue_from(8)
-    env.reset(start.set("_reset", torch.tensor([[False], [True]])))
-    share = transformed(Priced([[0.5] * 4]), "simmer")
-    share.set_state(env.get_state().chunk(2)[1])
-    assert share.reset()["observation"][0, -1].item() == pytest.approx(0.625)
-
-
 def test_the_episode_ends_when_more_than_the_budget_is_spent():
     costs = [[1.0, 1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 2.1], [0.0] * 6]
     end = EarlyTermination({"cost": 2.0, "cost_north": 40.0})  # one that is spent is enough
@@ -155,15 +145,6 @@ def test_episodes_of_an_evaluation_are_whole_unless_they_are_to_end_too(in_evalu
     batch = still(transformed(Priced([[3.0] * 6]), end=end, evaluating=True), 6)["next"]
     assert batch["terminated"].squeeze().nonzero()[:, 0].tolist() == ends
     assert batch["done"].squeeze().nonzero()[:, 0].tolist() == (ends or [5])
-
-
-def test_interventions_can_have_a_budget():
-    own = {"filter": ActionFilter(half_speed), "saute": Saute({"cost_interventions": 1.0}, **SAUTE)}
-    env = transformed(PointMass(1), **own)
-    step = env.step(env.reset().set("action", torch.ones(1, 2)))
-    assert step["next", "reward"].item() == -1
-    with pytest.raises(ValueError, match=r"transforms.saute: .*Did you mean 'cost_north'"):
-        transformed(PointMass(1), saute=Saute({"cost_noth": 1.0}, **SAUTE))
 
 
 @pytest.mark.parametrize("env", ["point_mass", "safety_gym"])

@@ -25,11 +25,6 @@ def test_keys_and_defaults_are_gymnasiums(name):
     assert ours == defaults
 
 
-@pytest.mark.parametrize("name", ["SafeHopperVelocity", "SafetyHopperVelocity-v1"])
-def test_names(name):
-    assert resolve_velocity(name) == resolve_velocity("SafeHopperVelocity")
-
-
 def test_another_robot_brings_its_own_keys():
     config = resolve_velocity("SafeHopperVelocity").replace(robot="ant", frame_skip=2)
     assert config == VelocityConfig.from_dict({"robot": "ant", "frame_skip": 2})

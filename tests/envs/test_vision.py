@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from pictures import make_env, needs_opengl
@@ -53,46 +52,6 @@ def test_vision_is_nested_and_flat():
     torch.testing.assert_close(flat.reset()["observation"][:, columns], picture.flatten(1))
     check_env_specs(nested)
     check_env_specs(flat)
-
-
-@needs_opengl
-def test_rows_see_their_own_world():
-    config = resolve("PointGoal1").replace(**VISION)
-    batch = SafetyGymEnv(config, num_envs=2, seed=3).reset()["observation", "vision"]
-    alone = SafetyGymEnv(config, num_envs=1, seed=3).reset()["observation", "vision"]
-    assert (batch[0] != batch[1]).any()
-    torch.testing.assert_close(batch[:1], alone)
-
-
-@needs_opengl
-def test_what_is_observed_is_the_new_state_and_without_markers():
-    env = SafetyGymEnv(resolve("CarButton1").replace(**VISION), num_envs=1, seed=0)
-    tensordict = env.reset()
-    tensordict["action"] = torch.ones(env.action_spec.shape)
-    picture = env.step(tensordict)["next", "observation", "vision"][0]
-    plain = SafetyGymEnv(resolve("CarButton1").replace(render_lidar_markers=False), seed=0)
-    plain.reset()
-    plain.set_state(env.get_state())
-    width, height = env.config.vision_size
-    drawn = plain.render(0, camera="vision", width=width, height=height) / 255
-    # Apart from the goal button's marker, the same: few pixels differ.
-    differs = np.abs(drawn - picture.numpy()).max(-1) > 1e-6
-    assert differs.mean() < 0.2
-    assert (picture != tensordict["observation", "vision"][0]).any()
-
-
-@needs_opengl
-def test_frames_have_an_inset_of_what_is_seen():
-    view = {"width": 300, "height": 240}
-    shown = make_env({**VISION, "vision_render_size": (90, 60)})
-    hidden = make_env({**VISION, "vision_render": False})
-    differs = (shown.render(0, **view) != hidden.render(0, **view)).any(-1)
-    assert differs[:60, :90].mean() > 0.5
-    assert not differs[60:].any()
-    assert not differs[:, 90:].any()
-    seen = shown.reset()["observation", "vision"][0].mul(255).round().numpy()
-    inset = shown.render(0, **view)[:60, :90]
-    np.testing.assert_array_equal(inset[0, [0, -1]], seen[0, [0, -1]])
 
 
 def test_a_robot_without_a_camera_is_an_error(tmp_path):

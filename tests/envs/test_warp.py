@@ -5,7 +5,7 @@ import pickle
 import pytest
 import torch
 from commands import run_train
-from looking import CountLooks, no_looks
+from looking import CountLooks
 from omegaconf import OmegaConf
 from run_configs import compose_config
 
@@ -107,30 +107,6 @@ def test_a_resumed_and_a_pickled_environment_continue_alike():
         torch.testing.assert_close(value, second[key], atol=1e-4, rtol=1e-4)
         torch.testing.assert_close(value, third[key], atol=1e-4, rtol=1e-4)
     assert env.get_positions()["gremlins"].shape == (4, 1, 3)
-
-
-@pytest.mark.parametrize(
-    "keys",
-    [
-        BUSY | {"action_noise": 0.1, "frameskip_binom_p": 0.9, "goal_size": 3.0},
-        BUSY | {"lidar_type": "natural", "terminate_resample_failure": False},
-    ],
-    ids=["noise", "natural lidar"],
-)
-def test_a_step_does_not_wait_for_the_device(keys, monkeypatch):
-    env = SafetyGymEnv(resolve(keys | {"physics": "warp"}), 2, seed=0)
-    state = env.reset()
-    env._step(state.set("action", env.action_spec.rand()))
-    # as on CUDA, where checks are read only once their values have arrived
-    monkeypatch.setattr(env._physics, "waits", True)
-    monkeypatch.setattr(env._physics._late, "look", lambda: None)
-    state.set("action", env.action_spec.rand())
-    with no_looks(env._physics, monkeypatch) as mode:
-        following = env._step(state)
-    assert mode.num_calls > 50
-    assert following["observation"].isfinite().all()
-    monkeypatch.undo()
-    env._physics._late.look()
 
 
 def looks_of_an_epoch(directory, num_steps, algo):
@@ -249,24 +225,6 @@ def test_a_lack_of_room_is_an_error_that_names_the_key(two):
     physics = WarpPhysics(two[0], 2, "cpu", contacts=1, constraints=256)
     with pytest.raises(BufferOverflowError, match=r"room for 1 contacts.*env\.physics_buffers"):
         physics.step(5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ["Point", "Car", "Doggo"])
-def test_all_names_of_the_suite_step(robot):
-    for name in [f"{robot}{task}{level}" for task in ("Goal", "Button", "Push") for level in "012"]:
-        cpu, warp = pair(name, 2)
-        assert warp.cost_keys == cpu.cost_keys
-        following = warp.rollout(3)["next"]
-        assert following["observation"].isfinite().all(), name
-        assert following["observation"].shape[-1] == cpu.observation_spec["observation"].shape[-1]
-
-
-def test_an_own_robot_between_walls_steps_as_on_the_cpu(tmp_path):
-    robot = tmp_path / "robot.xml"
-    robot.write_text(ROBOTS["point"].read_text())
-    keys = {"robot_base": str(robot), "walls_num": 2, "walls_locations": [[0.0, 1.0], [1.0, 0.0]]}
-    assert largest_difference(*pair(BUSY | keys, 2), 3).median() < 1e-5
 
 
 def test_what_warp_lacks_is_refused(tmp_path):

@@ -289,13 +289,6 @@ class SafetyGymEnv(SimulatedEnv):
         self._fixed_layout = state.get("fixed_layout", self._fixed_layout).clone()
         if "layout" not in state and not self._episode.any():
             self.reset()
-        self._write_worlds(state)
-        for name, tensor in self._remembered.items():
-            tensor.copy_(state.get(name, torch.zeros_like(tensor)))
-        self._measured.copy_(self._task.measure(self._world))
-
-    def _write_worlds(self, state: TensorDictBase) -> None:
-        """Set N worlds to a state that fits them, and compute all outputs."""
         world, scene, physics = self._world, self._world.scene, self._physics
         target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
         everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
@@ -314,3 +307,6 @@ class SafetyGymEnv(SimulatedEnv):
         place_mocaps(world)
         physics.forward()
         refresh(world)
+        for name, tensor in self._remembered.items():
+            tensor.copy_(state.get(name, torch.zeros_like(tensor)))
+        self._measured.copy_(self._task.measure(self._world))
