@@ -21,7 +21,7 @@ from safe_rl.checks import Checked
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import LimitState
 from safe_rl.resumable import Resumable
-from safe_rl.trust import TargetError, locate
+from safe_rl.trust import TargetError, instantiate, locate
 
 _DEFAULT = "safe_rl.algorithms.OnPolicy"
 
@@ -41,6 +41,32 @@ class Stateful(Protocol):
 def states_of(parts: Mapping[str, Stateful]) -> dict[str, Any]:
     """State of every part, by name."""
     return {name: part.state_dict() for name, part in parts.items()}
+
+
+def networks_of_target(
+    model: DictConfig, env: EnvBase, num_costs: int, device: torch.device, **others: Any
+) -> dict[str, Any]:
+    """Networks that ``model._target_`` builds, by name.
+
+    Raises:
+        TargetError: If one is missing.
+    """
+    given = {
+        "observation_spec": env.observation_spec,
+        "action_spec": env.action_spec,
+        "layout": env.observation_layout,
+        "num_costs": num_costs,
+        "device": device,
+    }
+    networks = instantiate(model, given | others)
+    needed = ["actor", "critic", *(["cost_critic"] if num_costs else [])]
+    missing = set(needed).difference(networks if isinstance(networks, dict) else ())
+    if missing:
+        raise TargetError(
+            f"model._target_={model['_target_']} must return a dictionary of networks with the "
+            f"names {', '.join(needed)}; it lacks {', '.join(sorted(missing))}."
+        )
+    return {name: networks[name] for name in needed}
 
 
 class Algorithm(ABC):

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.constraints import check_cost_limits
@@ -221,6 +221,8 @@ def _check_entries(
             why = "which critics read: record it, or set model.critic_observes=[observation]."
         raise ValueError(f"it has no {', '.join(dict.fromkeys(missing))}, {why}")
     spec = env.observation_spec
+    if isinstance(spec["observation"], Composite) or spec["observation"].ndim != 2:
+        raise ValueError("a dataset has vectors as observations, and this environment has others.")
     sizes = {"observations": spec["observation"].shape[-1], "actions": actions.shape[-1]}
     if "privileged" in buffer.in_keys:
         sizes["privileged"] = spec["privileged"].shape[-1]

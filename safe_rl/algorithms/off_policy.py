@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
+from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful, networks_of_target
 from safe_rl.algorithms.constraints import Constraints, constrained_limits
 from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.replay_buffer import Memory
@@ -22,9 +22,10 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy, QEnsemble
 from safe_rl.models.bounded_actors import bounded_actions
 from safe_rl.models.encoders import (
-    TO_FLATTEN,
+    Codes,
     Entry,
     Observed,
+    check_encoders,
     critic_entries,
     observed_entries,
 )
@@ -33,7 +34,7 @@ from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
 
-_ON_POLICY_ONLY = ("_target_", "encoders", "memory", "normalise")
+_ON_POLICY_ONLY = ("memory", "normalise")
 
 
 @dataclass
@@ -283,53 +284,56 @@ def build_networks(
             environment may not have them.
 
     Raises:
-        ValueError: If actions have no bounds, the observation is not a vector, the model is for
+        ValueError: If actions have no bounds, the model does not fit the observation or is for
             on-policy algorithms only, or the environment lacks an entry that critics read.
     """
     model, spec = config.model, bounded_actions(env)
     cost_values = MeanCosts() if cost_values is None else cost_values
-    _check_observation(config, env)
+    outputs = num_costs * cost_values.outputs
+    if model.get("_target_") is not None:
+        more = {"action_spec": spec, "cost_outputs": outputs}
+        return networks_of_target(model, env, num_costs, device, **more)
+    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
+        raise ValueError(
+            f"algo={config.algo.name}: model.{others[0]} is for on-policy algorithms. Use "
+            "model=mlp, model=cnn or model=dict without it."
+        )
     common: dict[str, Any] = {"hidden_sizes": list(model.hidden_sizes), "device": device}
-    actor = _inputs(critic_entries(None, env.observation_spec), config, env)
+    inputs = _inputs(critic_entries(None, env.observation_spec), config, env)
     bounds = {"low": spec.low, "high": spec.high}
-    networks = {"actor": instantiate(config.actor, **actor, **bounds, **common)}
-    entries = critic_entries(critic_observes, env.observation_spec)
-    common |= _inputs(entries, config, env)
-    common |= {"action_size": len(spec.low), "in_keys": [*(e.key for e in entries), "action"]}
+    networks = {"actor": instantiate(config.actor, **inputs(device), **bounds, **common)}
+    common["action_size"] = len(spec.low)
+    inputs = _inputs(critic_entries(critic_observes, env.observation_spec), config, env)
     if number := config.critics.rewards:
-        networks["critic"] = QEnsemble(num_networks=number, **common)
+        networks["critic"] = QEnsemble(num_networks=number, **inputs(device, "action"), **common)
     if num_costs and (number := config.critics.costs):
         networks["cost_critic"] = QEnsemble(
             num_networks=number * cost_values.networks,
-            num_outputs=num_costs * cost_values.outputs,
+            num_outputs=outputs,
             out_key="cost_state_action_value",
+            **inputs(device, "action"),
             **common,
         )
     return networks
 
 
-def _inputs(entries: Sequence[Entry], config: DictConfig, env: EnvBase) -> dict[str, Any]:
-    """Number of the columns of all entries together, and their factors, for a constructor."""
+def _inputs(
+    entries: Sequence[Entry], config: DictConfig, env: EnvBase
+) -> Callable[..., dict[str, Any]]:
+    """A function that returns arguments of a constructor for entries, with a new encoder."""
     layouts = {"observation": env.observation_layout, "privileged": env.privileged_layout}
-    observed = Observed(entries, layouts, config.model.input_scale, clip=None, encoders=None)
-    return {
-        "observation_size": sum(entry.shape[0] for entry in entries),
-        "input_scale": observed.scales(),
-    }
+    scale, encoders = config.model.input_scale, config.model.get("encoders")
+    observed = Observed(entries, layouts, scale, clip=None, encoders=encoders)
+    check_encoders(observed._replace(entries=observed_entries(env.observation_spec)))
 
+    def arguments(device: torch.device, *further: str) -> dict[str, Any]:
+        # an actor of the user's need not take keys that vectors do not need
+        needs_keys = further or encoders or observed.keys != ["observation"]
+        keys = {"in_keys": [*observed.keys, *further]} if needs_keys else {}
+        if encoders is None:
+            size = sum(entry.shape[0] for entry in entries)
+            return {"observation_size": size, "input_scale": observed.scales(), **keys}
+        codes = Codes(observed, device)
+        return {"observation_size": codes.size, "encoder": codes, **keys}
 
-def _check_observation(config: DictConfig, env: EnvBase) -> None:
-    """Refuse observations that are not one vector, and models for on-policy algorithms."""
-    model = config.model
-    if others := [key for key in _ON_POLICY_ONLY if model.get(key)]:
-        raise ValueError(
-            f"algo={config.algo.name} takes model=mlp only, and model.{others[0]} is for on-policy "
-            "algorithms. Use model=mlp without it."
-        )
-    observed = observed_entries(env.observation_spec)
-    if observed[0].key != "observation" or len(observed[0].shape) != 1:
-        raise ValueError(
-            f"algo={config.algo.name} needs an observation of one vector, and this environment "
-            f"observes {', '.join(map(str, observed))}: {TO_FLATTEN}, or use algo=ppo_lagrangian "
-            "with model=dict or model=cnn."
-        )
+    return arguments

@@ -18,6 +18,7 @@ from safe_rl.algorithms.algorithm_contract import (
     Algorithm,
     PolicyUpdate,
     Stateful,
+    networks_of_target,
 )
 from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints, constrained_limits
 from safe_rl.algorithms.losses import LossState
@@ -27,7 +28,7 @@ from safe_rl.models import build_networks, make_behaviour, take_in
 from safe_rl.objectives import CriticLoss, JointAdvantages, LimitState, Multiplier
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.trust import TargetError, instantiate
+from safe_rl.trust import instantiate
 
 
 @dataclass
@@ -208,21 +209,14 @@ def _build_networks(
     model: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Networks of the node ``model``, by name; a ``_target_`` builds networks of the user's own."""
-    given = {
-        "observation_spec": env.observation_spec,
-        "action_spec": env.action_spec,
-        "layout": env.observation_layout,
-        "num_costs": num_costs,
-        "device": device,
-    }
-    if (target := config.model.get("_target_")) is None:
-        return build_networks(model, **given, privileged_layout=env.privileged_layout)
-    networks = instantiate(config.model, given)
-    needed = ["actor", "critic", *(["cost_critic"] if num_costs else [])]
-    missing = set(needed).difference(networks if isinstance(networks, dict) else ())
-    if missing:
-        raise TargetError(
-            f"model._target_={target} must return a dictionary of networks with the names "
-            f"{', '.join(needed)}; it lacks {', '.join(sorted(missing))}."
-        )
-    return {name: networks[name] for name in needed}
+    if config.model.get("_target_") is not None:
+        return networks_of_target(config.model, env, num_costs, device)
+    return build_networks(
+        model,
+        env.observation_spec,
+        env.action_spec,
+        env.observation_layout,
+        num_costs=num_costs,
+        device=device,
+        privileged_layout=env.privileged_layout,
+    )

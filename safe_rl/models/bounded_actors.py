@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 from torch.nn.functional import softplus
@@ -17,6 +17,7 @@ from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
 
 from safe_rl.models.heads import Shape, action_sampler
 from safe_rl.models.input_scales import InputScale
+from safe_rl.models.networks import Chain
 
 _SCALE_FLOOR = 1e-3
 
@@ -26,6 +27,7 @@ def _perceptron(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None,
     device: torch.device | None,
+    encoder: nn.Module | None,
 ) -> list[nn.Module]:
     perceptron = MLP(
         *sizes,
@@ -35,7 +37,7 @@ def _perceptron(
         device=device,
     )
     scaling = [] if input_scale is None else [InputScale(input_scale.to(device))]
-    return [*scaling, perceptron]
+    return [*scaling, *([] if encoder is None else [encoder]), perceptron]
 
 
 def make_squashed_actor(
@@ -46,16 +48,21 @@ def make_squashed_actor(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
+    encoder: nn.Module | None = None,
+    in_keys: Sequence[NestedKey] = ("observation",),
 ) -> ProbabilisticTensorDictSequential:
     """Build a policy whose actions are the tanh of a Gaussian, within bounds (SAC's).
 
     Args:
-        observation_size: Length of the flat observation.
+        observation_size: Length of the flat observation, or of the encoder's outputs.
         low: Lower bounds of the action, [A].
         high: Upper bounds of the action, [A].
         hidden_sizes: Width of every hidden layer.
         input_scale: Fixed factors of the observation, or None.
         device: Device of the parameters.
+        encoder: Module before the perceptron, which takes the entries `in_keys`; it replaces
+            `input_scale`.
+        in_keys: Keys of the observation.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -64,11 +71,12 @@ def make_squashed_actor(
         >>> actor(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].abs().max() < 1
         tensor(True)
     """
-    layers = _perceptron((observation_size, 2 * len(low)), hidden_sizes, input_scale, device)
+    sizes = (observation_size, 2 * len(low))
+    layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
     extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
-    network = nn.Sequential(*layers, extractor)
+    network = Chain(*layers, extractor)
     return _SquashedActor(
-        TensorDictModule(network, in_keys=["observation"], out_keys=["loc", "scale"]),
+        TensorDictModule(network, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         action_sampler(("loc", "scale"), SquashedNormal, low=low.to(device), high=high.to(device)),
     )
 
@@ -81,6 +89,8 @@ def make_bounded_actor(
     hidden_sizes: Sequence[int],
     input_scale: Tensor | None = None,
     device: torch.device | None = None,
+    encoder: nn.Module | None = None,
+    in_keys: Sequence[NestedKey] = ("observation",),
 ) -> TensorDictModule:
     """Build a deterministic policy whose actions are the tanh of a network, within bounds (TD3's).
 
@@ -93,9 +103,10 @@ def make_bounded_actor(
         >>> bool(((action > 0) & (action < 1)).all())
         True
     """
-    layers = _perceptron((observation_size, len(low)), hidden_sizes, input_scale, device)
-    network = nn.Sequential(*layers, _Squash(low, high, device))
-    return TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+    sizes = (observation_size, len(low))
+    layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
+    network = Chain(*layers, _Squash(low, high, device))
+    return TensorDictModule(network, in_keys=list(in_keys), out_keys=["action"])
 
 
 class SquashedNormal(TanhNormal):
@@ -138,7 +149,7 @@ class _SquashedActor(ProbabilisticTensorDictSequential):
         **kwargs: Any,
     ) -> SquashedNormal:
         parameters, head = self
-        loc, scale = parameters.module(tensordict.get("observation"))
+        loc, scale = parameters.module(*map(tensordict.get, parameters.in_keys))
         return SquashedNormal(loc, scale, **head.distribution_kwargs)
 
 

@@ -13,10 +13,10 @@ from torchrl.data import Composite, TensorSpec
 from safe_rl.models.encoders import (
     FEATURES,
     RECURRENT,
-    TO_FLATTEN,
     Body,
     Observed,
     RecurrentLayer,
+    check_encoders,
     critic_entries,
     observed_entries,
 )
@@ -60,18 +60,7 @@ def build_networks(
     layouts = {"observation": layout, "privileged": privileged_layout or {}}
     observed = Observed(entries, layouts, model["input_scale"], clip=normalise, encoders=encoders)
     read = critic_entries(model.get("critic_observes"), observation_spec)
-    if encoders is not None and not encoders["vector"] and observed.is_vector:
-        raise ValueError(
-            "model=cnn encodes pictures, and this environment observes only a vector. Use "
-            "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
-        )
-    if encoders is None and not observed.is_vector:
-        pictures = any(len(entry.shape) == 3 for entry in entries)
-        advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
-        raise ValueError(
-            f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
-            f"vector: use {advice}, or {TO_FLATTEN}."
-        )
+    check_encoders(observed)
     widths = list(model["hidden_sizes"])
     recurrent_size = model["memory"]["size"] if model.get("memory") else 0
     if recurrent_size and RECURRENT not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping

@@ -125,7 +125,7 @@ class ExploringPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        outputs = self.network(tensordict.get(self.in_keys[0]))
+        outputs = self.network(*map(tensordict.get, self.in_keys))
         is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
         if self._samples:

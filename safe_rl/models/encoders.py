@@ -134,6 +134,60 @@ class Observed(NamedTuple):
         return torch.cat([torch.ones(n) if scale is None else scale for scale, n in parts])
 
 
+def check_encoders(observed: Observed) -> None:
+    """Refuse dictionaries and pictures without encoders, and encoders of pictures without any.
+
+    Raises:
+        ValueError: With the ``model`` to choose.
+    """
+    encoders, entries = observed.encoders, observed.entries
+    if encoders is not None and not encoders["vector"] and observed.is_vector:
+        raise ValueError(
+            "model=cnn encodes pictures, and this environment observes only a vector. Use "
+            "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
+        )
+    if encoders is None and not observed.is_vector:
+        pictures = any(len(entry.shape) == 3 for entry in entries)
+        advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
+        raise ValueError(
+            f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
+            f"vector: use {advice}, or {TO_FLATTEN}."
+        )
+
+
+def make_encoders(
+    observed: Observed, device: torch.device | None
+) -> tuple[list[nn.Module], list[int]]:
+    """An encoder for every entry, and the sizes of their outputs."""
+    encoders, sizes = [], []
+    for entry in observed.entries:
+        encoder = (_vector if len(entry.shape) == 1 else _picture)(entry, observed, device)
+        encoders.append(encoder)
+        sizes.append(encoder(_blank(entry, device)).shape[-1])
+    return encoders, sizes
+
+
+class Codes(nn.Module):
+    """Encode every entry, and concatenate the codes; of several entries or of pictures.
+
+    Args:
+        observed: The observed entries, and how they are encoded.
+        device: Device of the parameters.
+
+    Attributes:
+        size: Number of outputs.
+    """
+
+    def __init__(self, observed: Observed, device: torch.device | None = None) -> None:
+        super().__init__()
+        encoders, sizes = make_encoders(observed, device)
+        self.encoders, self.size = nn.ModuleList(encoders), sum(sizes)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Entries [..., n] or [..., height, width, colours] -> [..., size]."""
+        return torch.cat([encode(x) for encode, x in zip(self.encoders, inputs, strict=True)], -1)
+
+
 class Body(nn.Module):
     """Encode every entry, concatenate the codes, and run a perceptron on them.
 
@@ -156,12 +210,7 @@ class Body(nn.Module):
     ) -> None:
         super().__init__()
         assert observed.encoders is not None
-        encoders, sizes = [], []
-        for entry in observed.entries:
-            make = _vector if len(entry.shape) == 1 else _picture
-            encoder = make(entry, observed, device)
-            encoders.append(encoder)
-            sizes.append(encoder(_blank(entry, device)).shape[-1])
+        encoders, sizes = make_encoders(observed, device)
         self.encoders = nn.ModuleList(encoders)
         self.perceptron = perceptron(sum(sizes) + extra, out_features, hidden_sizes, None, device)
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.func import functional_call
 
 from safe_rl.models.input_scales import InputScale
 
@@ -80,6 +82,8 @@ class QEnsemble(TensorDictModuleBase):
         num_outputs: Values per network: 1 for the reward, K for K costs.
         input_scale: Fixed factors of these entries, or None.
         device: Device of the parameters.
+        encoder: Module from these entries to the `observation_size` inputs of all networks, which
+            share it; None: the entries side by side.
         in_keys: Keys of the observation (and of further entries that critics read) and the action.
         out_key: Key of the values.
 
@@ -100,12 +104,13 @@ class QEnsemble(TensorDictModuleBase):
         num_outputs: int = 1,
         input_scale: Tensor | None = None,
         device: torch.device | None = None,
+        encoder: nn.Module | None = None,
         in_keys: Sequence[NestedKey] = ("observation", "action"),
         out_key: NestedKey = "state_action_value",
     ) -> None:
         super().__init__()
         self.in_keys, self.out_keys = list(in_keys), [out_key]
-        self.num_networks = num_networks
+        self.num_networks, self.encoder = num_networks, encoder
         self.scale = nn.Identity() if input_scale is None else InputScale(input_scale.to(device))
         sizes = [observation_size + action_size, *hidden_sizes, num_outputs]
         self.network = EnsembleMLP(num_networks, sizes, device)
@@ -113,13 +118,26 @@ class QEnsemble(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return values [E, …, n] in a new TensorDict of shape [E, …], for steps […]."""
         *entries, action = (tensordict[key] for key in self.in_keys)
-        values = self.values(torch.cat(entries, -1), action)
+        values = self.values(entries, action)
         return TensorDict({self.out_keys[0]: values}, batch_size=values.shape[:-1])
 
-    def values(self, observation: Tensor, action: Tensor, layers: Layers | None = None) -> Tensor:
+    def values(
+        self, entries: Sequence[Tensor], action: Tensor, layers: tuple[Any, Layers] | None = None
+    ) -> Tensor:
         """Return values [E, …, n]: `forward` without TensorDicts, with own or given parameters."""
-        return self.network(torch.cat([self.scale(observation), action], -1), layers)
+        encoding, own = (None, None) if layers is None else layers
+        if self.encoder is None:
+            inputs = self.scale(entries[0] if len(entries) == 1 else torch.cat([*entries], -1))
+        elif encoding is None:
+            inputs = self.encoder(*entries)
+        else:
+            inputs = functional_call(self.encoder, encoding, tuple(entries))
+        return self.network(torch.cat([inputs, action], -1), own)
 
-    def layers(self, params: TensorDictBase) -> Layers:
+    def layers(self, params: TensorDictBase) -> tuple[Any, Layers]:
         """Convert parameters with the same names as the own ones to the argument of `values`."""
-        return self.network.layers(params["network"])
+        encoding = None
+        if self.encoder is not None:
+            flat = params["encoder"].flatten_keys(".")
+            encoding = {str(name): value for name, value in flat.items()}
+        return encoding, self.network.layers(params["network"])

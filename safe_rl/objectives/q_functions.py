@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -29,10 +29,10 @@ class Ensemble(Protocol):
         """Convert parameters to the argument of `values`."""
         ...
 
-    def values(self, observation: Tensor, action: Tensor, layers: Any) -> Tensor:
+    def values(self, entries: Sequence[Tensor], action: Tensor, layers: Any) -> Tensor:
         """Values [E, ..., n] without TensorDicts, whose overhead exceeds the computation.
 
-        If the network reads several entries of a state, `observation` has them side by side.
+        `entries` are those of a state that the network reads, in the order of `in_keys`.
         """
         ...
 
@@ -109,7 +109,7 @@ class QFunctionLoss(ReplayLoss):
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
         # TorchRL's losses name only what the actor reads in the next state
-        following = [("next", key) for key in self.qvalue_network.in_keys[:-1]]
+        following = [unravel_key(("next", key)) for key in self.qvalue_network.in_keys[:-1]]
         self._in_keys = list(dict.fromkeys([*self._in_keys, *following]))
 
     @dispatch
@@ -200,8 +200,7 @@ class QFunctionLoss(ReplayLoss):
             params = getattr(self, f"{'target_' if kind == 'target' else ''}{name}_params")
             cache[name, kind] = network.layers(params.data if kind == "frozen" else params)
         entries = [require(steps, key) for key in network.in_keys[:-1]]
-        observation = entries[0] if len(entries) == 1 else torch.cat(entries, -1)
-        return network.values(observation, action, cache[name, kind])
+        return network.values(entries, action, cache[name, kind])
 
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """An entry below ``next`` that holds one number per step, [..., 1].

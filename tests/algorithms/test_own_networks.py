@@ -1,4 +1,4 @@
-"""Networks that ``model._target_`` builds, for on-policy algorithms."""
+"""Networks that ``model._target_`` builds."""
 
 import pytest
 import torch
@@ -6,8 +6,8 @@ from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
 from run_configs import off_policy_config
 
-from safe_rl.algorithms import OffPolicy
-from safe_rl.models import make_actor, make_critic
+from safe_rl.models import QEnsemble, make_actor, make_critic, make_squashed_actor
+from safe_rl.training.building import build_trainer
 from safe_rl.trust import TargetError, allow
 
 TARGET = f"+model._target_={__name__}"
@@ -54,8 +54,38 @@ def test_a_missing_network_is_named(tmp_path):
         point_mass_trainer(tmp_path, "algo=cpo", f"{TARGET}.without_costs", minibatch_size=None)
 
 
-def test_an_off_policy_algorithm_refuses_it():
+def with_norm(hidden_sizes, observation_spec, action_spec, cost_outputs, **others):
+    """Layer normalisation before an off-policy actor's layers, and one ensemble of three."""
+    size, width = observation_spec["observation"].shape[-1], 12
+
+    def encoder():
+        return torch.nn.Sequential(torch.nn.Linear(size, width), torch.nn.LayerNorm(width))
+
+    low, high = action_spec.low, action_spec.high
+    critics = {"hidden_sizes": hidden_sizes, "num_networks": 3}
+    return {
+        "actor": make_squashed_actor(
+            width, low, high, hidden_sizes=hidden_sizes, encoder=encoder()
+        ),
+        "critic": QEnsemble(width, len(low), encoder=encoder(), **critics),
+        "cost_critic": QEnsemble(
+            size,
+            len(low),
+            num_outputs=cost_outputs,
+            out_key="cost_state_action_value",
+            **critics,
+        ),
+    }
+
+
+def test_an_off_policy_run_trains_the_networks_of_a_function(tmp_path):
     allow(__name__)
-    config = off_policy_config("algo=sac", f"{TARGET}.tall")
-    with pytest.raises(ValueError, match=r"model\._target_ is for on-policy algorithms"):
-        OffPolicy.from_config(config, PointMass(4))
+    config = off_policy_config("algo=sac_lagrangian", f"{TARGET}.with_norm", "frames=480")
+    trainer = build_trainer(config, PointMass(4), tmp_path)
+    networks = trainer.algorithm.networks
+    before = {name: [p.clone() for p in net.parameters()] for name, net in networks.items()}
+    assert networks["cost_critic"].num_networks == 3
+    trainer.run()
+    for name, network in networks.items():
+        pairs = zip(before[name], network.parameters(), strict=True)
+        assert not any(torch.equal(old, new) for old, new in pairs), name

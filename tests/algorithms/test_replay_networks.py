@@ -1,5 +1,7 @@
 """Which environments the networks of off-policy algorithms are for."""
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
 from point_mass import PointMass
@@ -7,6 +9,7 @@ from run_configs import off_policy_config
 from torchrl.data import Bounded, Composite, Unbounded
 
 from safe_rl.algorithms import OffPolicy
+from safe_rl.envs import from_gymnasium
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
@@ -34,9 +37,11 @@ def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
 @pytest.mark.parametrize(
     ("observation", "message"),
     [
-        (Composite(b=Unbounded((2, 3)), a=Unbounded((2, 4)), shape=[2]), r"a \[4\], b \[3\]: make"),
-        (Composite(a=Unbounded((2, 4)), shape=[2]), r"observes a \[4\]: make"),
-        (Unbounded((2, 9, 9, 3), dtype=torch.uint8), r"observes observation \[9, 9, 3\]: make"),
+        (
+            Composite(b=Unbounded((2, 3)), a=Unbounded((2, 4)), shape=[2]),
+            r"a \[4\], b \[3\], but model=mlp.*use model=dict",
+        ),
+        (Unbounded((2, 9, 9, 3), dtype=torch.uint8), r"\[9, 9, 3\], .*model=cnn for the pictures"),
     ],
 )
 def test_other_observations_than_a_vector_are_refused(observation, message):
@@ -44,6 +49,60 @@ def test_other_observations_than_a_vector_are_refused(observation, message):
     env.observation_spec = Composite(observation=observation, shape=[2])
     with pytest.raises(ValueError, match=message):
         OffPolicy.from_config(off_policy_config("algo=sac"), env)
+
+
+class Seen(gymnasium.Env):
+    """A bright column of a picture is where the point is; its speed is a number beside it."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = gymnasium.spaces.Dict(
+        picture=gymnasium.spaces.Box(0, 255, (36, 36, 3), np.uint8),
+        speed=gymnasium.spaces.Box(-9.0, 9.0, (1,), np.float32),
+    )
+
+    def _observe(self):
+        picture = np.zeros((36, 36, 3), np.uint8)
+        picture[:, int(18 + 8 * self.place)] = 255
+        return {"picture": picture, "speed": np.array([self.speed], np.float32)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.speed = self.np_random.uniform(-1, 1), 0.0
+        return self._observe(), {}
+
+    def step(self, action):
+        self.speed = float(action[0])
+        self.place = np.clip(self.place + 0.2 * self.speed, -2, 2)
+        return self._observe(), self.speed, False, False, {"cost": float(self.place > 0)}
+
+
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian", "wcsac"])
+def test_pictures_and_numbers_beside_them_are_learned_from(algo, tmp_path):
+    env = from_gymnasium(Seen, num_envs=4, num_steps=20, flatten=False, seed=0)
+    steps = ("memory.n_steps=3", "memory.capacity=1000")
+    config = off_policy_config(f"algo={algo}", "model=cnn", "frames=480", *steps)
+    trainer = build_trainer(config, env, tmp_path)
+    networks = trainer.algorithm.networks
+    before = {name: [p.clone() for p in net.parameters()] for name, net in networks.items()}
+    trainer.run()
+    for name, network in networks.items():
+        assert sum("encoder" in key for key, _ in network.named_parameters()) == 6, name
+        pairs = zip(before[name], network.parameters(), strict=True)
+        assert not any(torch.equal(old, new) for old, new in pairs), name
+
+
+def test_pictures_are_stored_with_those_three_steps_later():
+    env = from_gymnasium(Seen, num_envs=2, num_steps=20, flatten=False, seed=0)
+    config = off_policy_config("algo=sac", "model=cnn", "memory.n_steps=3", "memory.capacity=1000")
+    memory = OffPolicy.from_config(config, env).replay_buffer
+    steps = env.rollout(8, policy=lambda step: step.set("action", torch.ones(2, 1)))
+    memory.extend(steps)
+    batch = next(iter(memory.minibatches(1)))
+    here, after = batch["observation", "picture"], batch["next", "observation", "picture"]
+    assert here.dtype == torch.uint8
+    first, then = (picture[:, 0, :, 0].int().argmax(1) for picture in (here, after))
+    # by 1.6 columns in each step
+    assert set((then - first)[first < 28].tolist()) <= {4, 5}
 
 
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])

@@ -74,8 +74,8 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
         trainer.close()
 
 
-@pytest.mark.parametrize("choice", ["+model.normalise=10", "model=dict", "model=gru"])
-def test_off_policy_algorithms_take_perceptrons_alone(choice):
+@pytest.mark.parametrize("choice", ["+model.normalise=10", "model=gru"])
+def test_off_policy_algorithms_neither_normalise_nor_remember(choice):
     config = compose_config("algo=sac", "env=PointGoal1", choice)
     with pytest.raises(ValueError, match=r"algo=sac.*model\.\w+ is for on-policy algorithms"):
         find_algorithm(config).from_config(config, make_env("PointGoal1", num_envs=2, seed=0))
