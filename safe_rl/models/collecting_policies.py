@@ -195,7 +195,8 @@ class HeldActions(TensorDictModuleBase):
         if decides.any():
             chosen = self.policy(tensordict.select(*self.in_keys)).get("action")
             where = decides.reshape(*shape, *[1] * (chosen.ndim - len(shape)))
-            all_decide = self._held is None or bool(decides.all())
-            self._held = chosen if all_decide else torch.where(where, chosen, self._held)
+            if self._held is not None and not decides.all():
+                chosen = torch.where(where, chosen, self._held)
+            self._held = chosen
         self._taken = self._taken + 1
         return tensordict.set("action", self._held)
