@@ -12,7 +12,9 @@ from gymnasium.spaces import Box, Discrete, Tuple
 from gymnasium_envs import Walk, make_pendulum
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium
+from safe_rl.envs import ConfigError, SafetyGymEnv, from_gymnasium, make_env
+
+NODE = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "cost_keys": ["fast"], "num_steps": 9}
 
 
 class Counter(gymnasium.Env):
@@ -89,6 +91,12 @@ WRONG_STEPS = {
     "text": ({0: {"count": 1, "length": "far"}}, r"\['length'\] must be numbers.*'far'"),
     "rewards": ({1: np.ones(3)}, r"the reward must be one number, but step 1 .*\(3,\)"),
     "cost": ({4: {"cost": "hot"}}, r"info\['cost'\] must be one number"),
+    "ragged": ({0: {"count": 1, "length": [[1], [2, 3]]}}, r"\['length'\] must be numbers of"),
+    "choice": ({0: {"count": 7, "length": np.zeros(1)}}, r"\['count'\] must be in Discrete\(5\)"),
+    "half": ({0: {"count": 0.5, "length": np.zeros(1)}}, r"\['count'\] must be whole numbers"),
+    "huge": ({1: 10**400}, "the reward must be one number"),
+    "ends": ({2: np.zeros(3, bool)}, r"terminated must be True or False, .*bool and the shape"),
+    "word": ({3: "no"}, "truncated must be True or False, but step 1 returned a str, 'no'"),
     "no info": ({4: None}, "info must be a dictionary, but step 1"),
 }
 
@@ -104,6 +112,18 @@ def test_what_a_step_must_not_return_is_told_with_entry_shape_and_step(changes, 
         env.rollout(2)
 
 
+def test_an_answer_that_gymnasium_cannot_take_is_told_with_its_step():
+    for wrong, words in ((None, "step failed at step 1: .*NoneType"), ((1, 2), "step failed at")):
+        kind = type("Wrong", (Walk,), {"step": lambda env, action, wrong=wrong: wrong})
+        gymnasium.register("WrongWalk-v0", kind, max_episode_steps=9)
+        env = make_env({**NODE, "id": "WrongWalk-v0"}, num_envs=1, seed=0)
+        with pytest.raises(ConfigError, match=words):
+            env.rollout(1)
+    kind = type("Wrong", (Walk,), {"reset": lambda env, **kwargs: None})
+    with pytest.raises(ConfigError, match="what a reset returns must be"):
+        from_gymnasium(kind, cost_keys=["fast"], num_steps=3, seed=0)
+
+
 def test_a_cost_that_comes_late_and_is_not_counted_is_told():
     class Late(Counter):
         def step(self, action):
@@ -113,6 +133,14 @@ def test_a_cost_that_comes_late_and_is_not_counted_is_told():
     env = from_gymnasium(Late, num_envs=1, num_steps=6, seed=5)
     with pytest.warns(UserWarning, match=r"info\['cost_b'\] of step 3 is not counted.*cost,cost_l"):
         env.rollout(4)
+
+
+def test_an_entry_that_a_step_writes_itself_is_refused():
+    wrong = type(
+        "Wrong", (Counter,), {"observation_space": gymnasium.spaces.Dict(reward=Box(0, 1))}
+    )
+    with pytest.raises(ConfigError, match="an entry 'reward': rename it"):
+        from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=False)
 
 
 @pytest.mark.parametrize("name", ["a.b", "graph"])

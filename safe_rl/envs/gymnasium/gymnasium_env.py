@@ -5,9 +5,11 @@ Wrappers convert observations, actions and costs of the single environments.
 
 from __future__ import annotations
 
+import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -25,6 +27,7 @@ from safe_rl.envs.pictures import resize
 from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
+_WRITTEN = ("action", "reward", "done", "terminated", "truncated")
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
@@ -42,6 +45,12 @@ def make_adapted(
     env: gymnasium.Env = CheckedSteps(make(), cost_keys, watch)
     seen, actions = env.observation_space, env.action_space
     _check_space(seen, flatten)
+    taken = {*_WRITTEN, *cost_keys} & set(seen if isinstance(seen, spaces.Dict) else ())
+    if taken and not flatten:
+        raise ConfigError(
+            f"The observation has an entry '{min(taken)}': rename it, because a step writes one of "
+            "this name."
+        )
     if not isinstance(actions, Box | Discrete | MultiDiscrete | MultiBinary):
         raise ConfigError(
             "The algorithms need actions that are continuous and bounded (a Box) or choices "
@@ -96,14 +105,20 @@ class CheckedSteps(gymnasium.Wrapper):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset, and check what is returned."""
         self._step = 0
-        observation, info = self.env.reset(**kwargs)
+        found = self._ask(self.env.reset, **kwargs)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise self._wrong("what a reset returns", "(observation, info)", found)
+        observation, info = found
         self._check("observation", self.observation_space, observation)
         return observation, {} if info is None else info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, check what is returned, and convert the costs."""
         self._step += 1
-        *values, info = self.env.step(action)
+        found = self._ask(self.env.step, action)
+        if not isinstance(found, tuple):
+            raise self._wrong("what a step returns", "a tuple", found)
+        *values, info = found
         if len(values) != 4:
             raise ConfigError(
                 f"A step of {self.env} returned {len(values) + 1} values instead of five. If its "
@@ -113,7 +128,22 @@ class CheckedSteps(gymnasium.Wrapper):
             raise self._wrong("info", "a dictionary", info)
         self._check("observation", self.observation_space, values[0])
         costs = {key: self._number(f"info['{key}']", info[key]) for key in self._costs_of(info)}
+        for name, end in zip(("terminated", "truncated"), values[2:], strict=True):
+            if not isinstance(end, bool | np.bool_ | int | np.integer):
+                raise self._wrong(name, "True or False", end)
         return values[0], self._number("the reward", values[1]), *values[2:], {**info, **costs}
+
+    def _ask(self, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call the environment; name it where Gymnasium's wrappers cannot take its answer."""
+        try:
+            return method(*args, **kwargs)
+        except (AssertionError, TypeError, ValueError, gymnasium.error.Error) as error:
+            last = traceback.extract_tb(error.__traceback__)[-1].filename
+            if not Path(last).is_relative_to(Path(gymnasium.__file__).parent):
+                raise  # the environment's own error
+            raise ConfigError(
+                f"{self.unwrapped}: {method.__name__} failed at step {self._step}: {error}"
+            ) from error
 
     def _costs_of(self, info: dict[str, Any]) -> list[str]:
         """Names of the costs in `info`; one warning about those that are not counted."""
@@ -133,20 +163,38 @@ class CheckedSteps(gymnasium.Wrapper):
                 if not isinstance(value, Mapping) or key not in value:
                     raise self._wrong(name, f"a dictionary with '{key}'", value)
                 self._check(f"{name}['{key}']", inner, value[key])
-        elif isinstance(space, Box | MultiBinary | MultiDiscrete):
+        elif isinstance(space, spaces.Tuple):
+            if not isinstance(value, list | tuple) or len(value) != len(space):
+                raise self._wrong(name, f"a tuple of {len(space)}", value)
+            for number, inner in enumerate(space):
+                self._check(f"{name}[{number}]", inner, value[number])
+        elif isinstance(space, Box | MultiBinary | MultiDiscrete | Discrete):
+            self._check_array(name, space, value)
+
+    def _check_array(self, name: str, space: gymnasium.Space, value: Any) -> None:
+        try:
             array = np.asarray(value)
-            if array.shape != space.shape or array.dtype.kind not in "fiub":
-                raise self._wrong(name, f"numbers of the shape {space.shape}", value)
+        except ValueError:
+            raise self._wrong(name, f"numbers of the shape {space.shape}", value) from None
+        kinds, wanted = ("fiub", "numbers") if isinstance(space, Box) else ("iub", "whole numbers")
+        if array.shape != space.shape or array.dtype.kind not in kinds:
+            raise self._wrong(name, f"{wanted} of the shape {space.shape}", value)
+        if isinstance(space, Discrete | MultiDiscrete):
+            sizes = space.n if isinstance(space, Discrete) else space.nvec
+            if ((array < space.start) | (array >= space.start + sizes)).any():
+                raise self._wrong(name, f"in {space}", value)
 
     def _number(self, name: str, value: Any) -> float:
         try:
             return float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise self._wrong(name, "one number", value) from None
 
     def _wrong(self, name: str, wanted: str, value: Any) -> ConfigError:
-        shape = getattr(value, "shape", None)
-        got = f"a {type(value).__name__}" + (f" of the shape {shape}" if shape else f", {value!r}")
+        shape, kind = getattr(value, "shape", None), type(value).__name__
+        got = (
+            f"a {kind} of {value.dtype} and the shape {shape}" if shape else f"a {kind}, {value!r}"
+        )
         return ConfigError(
             f"{self.unwrapped}: {name} must be {wanted}, but step {self._step} returned {got:.200}."
         )
