@@ -26,7 +26,7 @@ from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.command import config_dirs, repeating
-from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.folder import checkpoint_steps, is_unfinished
 from safe_rl.runs.run import Run
 
 POLICIES = Path(__file__).parents[1] / "policies"
@@ -73,11 +73,23 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     source, target = Run(run), Run(folder)
     path, config = source.find_checkpoint(checkpoint), source.config
     is_exported = (folder / "policy.json").is_file() and folder.resolve() != run.resolve()
-    if any(folder.glob("*")) and not is_exported:
+    others = [path for path in folder.glob("*") if not is_unfinished(path)]
+    if others and not is_exported:
         raise FileExistsError(f"{folder} has other files: give a new folder for the policy.")
     steps = checkpoint_steps(path)
     is_certified = source.certificate_of(path) is not None
     kept = target.checkpoint_file("certified" if is_certified else "last", steps or 0)
+    overrides, hydra = (
+        read_yaml(file) if file.is_file() else None
+        for file in (source.overrides_file, source.hydra_file)
+    )
+    about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
+    about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra))}
+    if source.code:
+        about["commit"] = source.code[-1]["commit"]
+    # first: an export that was killed can be repeated into its folder
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_json(folder / "policy.json", about)
     for former in (target.checkpoints_folder, target.robot_folder):
         shutil.rmtree(former, ignore_errors=True)
     kept.parent.mkdir(parents=True)
@@ -89,15 +101,6 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         shutil.copytree(source.robot_folder, target.robot_folder, symlinks=True)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}
     save_tensors(kept, {"facts": facts, "parts": read_states(path, ["actor"])})
-    overrides, hydra = (
-        read_yaml(file) if file.is_file() else None
-        for file in (source.overrides_file, source.hydra_file)
-    )
-    about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
-    about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra))}
-    if source.code:
-        about["commit"] = source.code[-1]["commit"]
-    replace_json(folder / "policy.json", about)
     return kept
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
@@ -20,7 +21,8 @@ _CHECKPOINT = re.compile(r"checkpoint-(\d+)\.torchrl")
 # the end of the name of a run's folder, as commands make it: date, seed, number of a repetition
 _OF_SEED = re.compile(r"(^\d{4}-[\d_-]+)?seed\d+(_\d+)?$")
 # see `safe_rl.files.replacing`
-_UNFINISHED = re.compile(r"\.(?!evaluation|variations)[\w-]+\.[0-9a-f]{16}\.\w+")
+_UNFINISHED = re.compile(r"\.[\w-]+\.[0-9a-f]{16}\.\w+")
+_DAY = 86_400.0  # [s]
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 
@@ -141,11 +143,18 @@ def lock_folder(file: Path) -> Iterator[None]:
         yield
 
 
-def _remove_unfinished(directory: Path) -> None:
-    """Remove what a killed process had not finished to write, but for evaluations.
+def is_unfinished(path: Path) -> bool:
+    """Whether a file is one that :func:`safe_rl.files.replacing` has not finished to write."""
+    return _UNFINISHED.fullmatch(path.name) is not None and path.is_file()
 
-    An evaluation writes without the lock, so it may be writing now.
+
+def _remove_unfinished(directory: Path) -> None:
+    """Remove what a killed process had not finished to write.
+
+    An evaluation writes without the lock, so what it may be writing now stays for a day.
     """
-    for path in paths_below(directory, ".*"):
-        if _UNFINISHED.fullmatch(path.name) and path.is_file():
-            path.unlink(missing_ok=True)
+    for path in filter(is_unfinished, paths_below(directory, ".*")):
+        with suppress(FileNotFoundError):
+            is_old = time.time() - path.stat().st_mtime > _DAY
+            if is_old or not path.name.startswith((".evaluation", ".variations")):
+                path.unlink()

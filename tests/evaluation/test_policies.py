@@ -5,6 +5,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import gymnasium
 import numpy as np
@@ -80,6 +81,16 @@ def test_only_a_certified_policy_is_packed_as_certified(run, tmp_path):
         assert [path.name for path in (packed / "checkpoints").iterdir()] == [kind]
         assert (packed / "certificate.json").is_file() == (kind == "certified")
         shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified", dirs_exist_ok=True)
+
+
+def test_an_export_that_was_killed_can_be_repeated(run, tmp_path, monkeypatch):
+    packed = tmp_path / "packed"
+    with monkeypatch.context() as patch:
+        patch.setattr(policies, "save_tensors", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            policies.pack_policy(run, packed, "last")
+    (packed / ".policy.0123456789abcdef.json").touch()  # of one that was killed still earlier
+    assert policies.pack_policy(run, packed, "last").is_file()
 
 
 @pytest.mark.parametrize("path", sorted(policies.POLICIES.glob("*/certificate.json")), ids=str)

@@ -106,10 +106,12 @@ def test_what_a_killed_process_left_is_removed(tmp_path):
     left = [run.directory / f".config.{mark}.yaml", run.directory / f".curves.{mark}.png"]
     left.append(run.checkpoints_folder / "last" / f".checkpoint-000000000040.{mark}.torchrl")
     kept = run.directory / f".evaluation.{mark}.json"  # of an evaluation that is running
-    for path in (*left, kept):
+    old = run.directory / f".evaluation_old.{mark}.csv"
+    for path in (*left, kept, old):
         path.touch()
+    os.utime(old, (1e9, 1e9))
     train(small("certificate.episodes=0"), run.directory, continues=True)
-    assert not any(path.exists() for path in left)
+    assert not any(path.exists() for path in (*left, old))
     assert kept.exists()
 
 
