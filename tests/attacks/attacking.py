@@ -1,0 +1,56 @@
+"""What the attacks share: random cases for some seconds, processes to kill, small runs."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+from commands import ROOT, SMALL
+
+SEED = int(os.environ.get("ATTACK_SEED") or time.time())
+"""Every week another one; a failure names it, and ATTACK_SEED=… repeats it."""
+RUN = (*SMALL, "critic_update.minibatch_size=20", "checkpoint.interval=0", "seed=3")
+
+
+SCALE = float(os.environ.get("ATTACK_SCALE", 1))
+"""Factor of all durations: 0 tries a case or a few of each attack."""
+
+
+def cases(name, seconds, least=3):
+    """Random generators, one per case, for about so many seconds."""
+    end, number = time.monotonic() + SCALE * seconds, 0
+    least = least if SCALE else 1
+    while number < least or time.monotonic() < end:
+        case = f"{name} ATTACK_SEED={SEED} case {number}"
+        print(case, flush=True)  # pytest shows it if the case fails
+        yield random.Random(case)
+        number += 1
+    print(f"{name}: {number} cases", file=sys.__stderr__, flush=True)
+
+
+def start(*words, limits="", **environment):
+    """A process of its own group; `limits` are commands of the shell before it."""
+    outside = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    return subprocess.Popen(
+        ["bash", "-c", f'{limits} exec "$@"', "bash", sys.executable, *words],
+        cwd=ROOT, env=outside | environment, start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+
+
+def said_by(process, patience=300):
+    """What a process printed until its end; it must end."""
+    try:
+        return process.communicate(timeout=patience)[0]
+    finally:
+        kill_all(process)
+
+
+def kill_all(process):
+    """End a process and all of its group."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
