@@ -49,6 +49,23 @@ def test_it_says_what_steps_cost_and_where_objects_are():
     torch.testing.assert_close(speed, env._world.velocities.norm(dim=-1).float())
 
 
+def test_some_of_its_components_may_be_chosen():
+    every, some = make(), make(observe_privileged=("cost_traces", "hazards_position"))
+    check_env_specs(some)
+    steps = []
+    for env in (every, some):
+        env.set_seed(0)
+        torch.manual_seed(0)
+        steps.append(env.rollout(20)["next"])
+    assert list(some.privileged_layout) == ["cost_traces", "hazards_position"]
+    for name in some.privileged_layout:
+        assert torch.equal(part(every, steps[0], name), part(some, steps[1], name))
+    with pytest.raises(
+        ConfigError, match=r"no component 'cost_trace'\. Did you mean 'cost_traces'"
+    ):
+        make(observe_privileged=("cost_trace",))
+
+
 def test_since_goal_counts_from_the_last_goal():
     env = make("PointGoal0", goal_size=1.5, constrain_vases=False)
     step = env.rollout(30)["next"]

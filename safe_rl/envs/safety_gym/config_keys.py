@@ -49,7 +49,10 @@ _LIDAR = "whether there is a lidar for "
 _COSTS = "whether there is a cost for "
 _NUMBER = "number of objects"
 _NO_PLACE = "end an episode if there is no place for a new goal; False: an error"
-_PRIVILEGED = "an entry `privileged` for critics: costs, and places and velocities of all objects"
+_PRIVILEGED = (
+    "an entry `privileged` for critics: costs, and places and velocities of all objects; or some "
+    "of its components only, such as `[last_costs, cost_traces]`"
+)
 _SENSORS = ("accelerometer", "velocimeter", "gyro", "magnetometer")
 _UNUSED = "not used; exists because the 2019 engine has it"
 
@@ -107,7 +110,7 @@ class Keys:
     observe_buttons: Annotated[bool, _LIDAR + "buttons"] = False
     observe_gremlins: Annotated[bool, _LIDAR + "gremlins"] = False
     observe_vision: Annotated[bool, "image of the robot's camera"] = False
-    observe_privileged: Annotated[bool, _PRIVILEGED] = False
+    observe_privileged: Annotated[bool | tuple[Text, ...], _PRIVILEGED] = False
     observe_qpos: Annotated[bool, "positions of joints; a planar root's from its start"] = False
     observe_qvel: Annotated[bool, "velocities of joints"] = False
     observe_ctrl: Annotated[bool, "the last control"] = False

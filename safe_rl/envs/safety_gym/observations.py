@@ -290,6 +290,8 @@ class Privileged:
     `buttons_timer` (steps until buttons have an effect again, as a share of those after a goal) and
     `since_goal` (steps since the goal changed, as a share of the longest episode).
 
+    The key `observe_privileged` is true for all of them, or names some.
+
     Args:
         world: The worlds.
         num_costs: Number of cost keys, K.
@@ -307,7 +309,18 @@ class Privileged:
         for kind, span in scene.slots.items():
             if span.stop <= scene.num_free:
                 sizes[f"{kind}_velocity"] = 3 * (span.stop - span.start)
-        self.columns = add_columns({}, sizes | {"buttons_timer": 1, "since_goal": 1})
+        sizes |= {"buttons_timer": 1, "since_goal": 1}
+        asked = scene.config.observe_privileged
+        chosen = tuple(sizes) if isinstance(asked, bool) else asked
+        for name in chosen:
+            if name not in sizes:
+                raise ConfigError(
+                    f"'observe_privileged': there is no component '{name}'."
+                    f"{did_you_mean(name, sizes)} Here there are {', '.join(sizes)}."
+                )
+        self.columns = add_columns({}, {name: n for name, n in sizes.items() if name in chosen})
+        is_kept = [name in chosen for name, size in sizes.items() for _ in range(size)]
+        self._kept = torch.tensor(is_kept, device=world.com.device).nonzero().squeeze(1)
         self._world = world
         self.past = {
             "last_costs": world.com.new_zeros(num_envs, num_costs),
@@ -337,4 +350,5 @@ class Privileged:
         timer = world.buttons_timer / max(1, config.buttons_resampling_delay)
         counts = [timer, since_goal / config.num_steps]
         values = [last, traces, positions.flatten(1), velocities.flatten(1)]
-        return torch.cat([*values, *(count.unsqueeze(1) for count in counts)], 1).float()
+        entry = torch.cat([*values, *(count.unsqueeze(1) for count in counts)], 1)
+        return entry.index_select(1, self._kept).float()
