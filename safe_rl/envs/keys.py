@@ -89,6 +89,7 @@ def describe(annotation: Any) -> str:
     """Return the allowed values of an annotation in words.
 
     Examples:
+        >>> from safe_rl.checks import Share
         >>> describe(Share | None)
         'number from 0 to 1, or null'
     """

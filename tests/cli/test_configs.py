@@ -130,6 +130,7 @@ SHARED = {
         "hidden_sizes": [256, 256],
         "initial_log_std": -0.5,
         "input_scale": {},
+        "critic_observes": ["observation"],
         "head": "auto",
         "normalise": None,
         "encoders": None,
