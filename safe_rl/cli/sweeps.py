@@ -32,6 +32,8 @@ from safe_rl.runs.run import Run
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""
 
+_failed: set[str] = set()  # folders of the jobs of this process that have failed
+
 
 def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> float:
     """Begin or continue the run of one job; a failure is written into its folder.
@@ -47,6 +49,7 @@ def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> fl
     from safe_rl.training.train import run_job  # with torch: a sweep starts without it
 
     folder = Run(directory)
+    _failed.discard(str(directory))
     try:
         import_modules(config.get("import"))
         name_choices(config, settings)
@@ -58,6 +61,7 @@ def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> fl
     except Exception as error:
         summary = f"{type(error).__name__}: {' '.join(str(error).split())}"
         print(f"{directory}: {summary}", file=sys.stderr)
+        _failed.add(str(directory))
         if not isinstance(error, RunInUseError):  # then another process owns the folder
             folder.directory.mkdir(parents=True, exist_ok=True)
             text = "".join(traceback.format_exception(error))
@@ -108,9 +112,9 @@ class Summary(Callback):
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
         """Note how a job has ended."""
         if config.hydra.mode == RunMode.MULTIRUN:
-            failure = Run(Path(config.hydra.runtime.output_dir)).failure_file
-            # a job that fails writes the file, and returns a number to the sweeper
-            self._note(config, "failed" if failure.exists() else "done")
+            # a job that fails returns a number to the sweeper
+            has_failed = config.hydra.runtime.output_dir in _failed
+            self._note(config, "failed" if has_failed else "done")
 
     def _note(self, config: DictConfig, state: str) -> None:
         # one write per line: several processes append to the file

@@ -29,7 +29,8 @@ def test_jobs_at_a_time_share_the_cores(tmp_path, monkeypatch, workers, threads)
     monkeypatch.setattr(joblib, "cpu_count", lambda: 8)
     monkeypatch.setenv("SAFE_RL_NUM_THREADS", "1")
     monkeypatch.setenv(LINE_SECONDS, "1")
-    config = OmegaConf.create({"hydra": {"launcher": {"n_jobs": workers}}})
+    node = {"launcher": {"n_jobs": workers}, "sweep": {"dir": str(tmp_path)}}
+    config = OmegaConf.create({"hydra": node})
     Summary(f"{tmp_path}/sweeps/first.jsonl").on_multirun_start(config)
     assert os.environ["SAFE_RL_NUM_THREADS"] == str(threads)
 
@@ -47,6 +48,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     def carry_out(number):
         directory = tmp_path / f"seed{number}"
         node = {"job": {"num": number}, "mode": "MULTIRUN", "runtime": {"choices": {}}}
+        node["overrides"] = {"task": []}
         node["runtime"]["output_dir"] = str(directory)
         config = OmegaConf.create({"hydra": node})
         config.hydra.mode = RunMode.MULTIRUN
@@ -124,7 +126,7 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
         pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     # the constrained algorithm cannot work without a limit, the other one does not need any
     jobs = ["env=PointGoal1", "algo=trpo,cpo", "seed=0,10", f"hydra/launcher={launcher}"]
-    jobs += ["default_cost_limits=null", "cost_limits={}", "policy_update.target_kl=0.01"]
+    jobs += ["default_cost_limits=null", "cost_limits={}", "++policy_update.target_kl=0.01"]
     first = sweep(tmp_path, *jobs, status=1)
     assert "Sweep: 2 of 4 runs are finished." in first
     assert first.count("needs at least one entry in cost_limits") == 2
