@@ -75,7 +75,7 @@ def test_presets_replace_keys_of_an_algorithm():
     assert (config.loss.gamma, config.memory.n_steps) == (0.98, 3)
     config = compose_config("algo=sac_lagrangian", "preset=privileged")
     assert list(config.transforms) == ["action_repeat"]
-    assert config.env.observe_privileged
+    assert config.env.observe_privileged == ["last_costs", "cost_traces"]
     assert config.model.critic_observes == ["observation", "privileged"]
 
 
