@@ -78,8 +78,7 @@ def prepare(words: Sequence[str]) -> list[str]:
         >>> prepare(["slate=SGPoint", "-m", "seed=0"])
         ['-m', 'seed=0', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2']
     """  # noqa: E501
-    chosen = [word.removeprefix("env=") for word in words if word.startswith("env=")]
-    store_configs((chosen or ["PointGoal1"]) if {"--help", "-h"} & {*words} else None)
+    store_configs(_shown(words))
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)
@@ -96,6 +95,19 @@ def prepare(words: Sequence[str]) -> list[str]:
             )
         words.append(f"env={','.join(SLATES[name])}")
     return [*words, *(overrides_of({"import": modules}) if modules is not None else ())]
+
+
+def _shown(words: Sequence[str]) -> list[str] | None:
+    """Environments whose keys the store needs for a help; None: all, also if no help is asked for.
+
+    To list its groups Hydra copies the store a hundred times: ten seconds with all environments.
+    But a file of the user's may build on any of them.
+    """
+    has_files = any(word.startswith(("-c", "--config-", "hydra.searchpath=")) for word in words)
+    if has_files or not {"--help", "-h"} & {*words}:
+        return None
+    chosen = [word.removeprefix("env=") for word in words if word.startswith("env=")]
+    return chosen or ["PointGoal1"]  # the default of conf/config.yaml
 
 
 def job(config: DictConfig) -> float | None:

@@ -109,6 +109,20 @@ def test_the_help_lists_every_environment(monkeypatch, capsys):
     )  # the default's keys
 
 
+def test_the_help_has_the_keys_of_a_file_that_builds_on_an_environment(
+    tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "crowd.yaml").write_text("defaults: [CarGoal1]\nhazards_num: 17\n")
+    words = ["--help", f"--config-dir={tmp_path}", "env=crowd", "env.vases_num=2"]
+    monkeypatch.setattr(sys, "argv", ["train.py", *words])
+    with pytest.raises(SystemExit) as end:
+        train.main()
+    assert not end.value.code
+    help_text = capsys.readouterr().out
+    assert all(line in help_text for line in ("hazards_num: 17", "vases_num: 2", "robot_base: car"))
+
+
 def test_learning_rates_are_given_by_the_names_of_parameters():
     config = compose_config("env=PointMass", "algo=sac", "policy_update.rates={log_alpha: 1e-4}")
     update = find_algorithm(config).from_config(config, PointMass(2)).policy_update
