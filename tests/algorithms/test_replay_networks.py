@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium_envs import Walk
 from point_mass import PointMass
 from run_configs import off_policy_config
 from torchrl.data import Bounded, Composite, Unbounded
@@ -51,7 +52,7 @@ def test_other_observations_than_a_vector_are_refused(observation, message):
         OffPolicy.from_config(off_policy_config("algo=sac"), env)
 
 
-class Seen(gymnasium.Env):
+class Seen(Walk):
     """A bright column of a picture is where the point is; its speed is a number beside it."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -64,11 +65,6 @@ class Seen(gymnasium.Env):
         picture = np.zeros((36, 36, 3), np.uint8)
         picture[:, int(18 + 8 * self.place)] = 255
         return {"picture": picture, "speed": np.array([self.speed], np.float32)}
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.speed = self.np_random.uniform(-1, 1), 0.0
-        return self._observe(), {}
 
     def step(self, action):
         self.speed = float(action[0])
