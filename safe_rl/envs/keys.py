@@ -17,7 +17,7 @@ from annotated_types import Interval
 from pydantic import ValidationError
 
 from safe_rl import checks
-from safe_rl.checks import SettingError
+from safe_rl.checks import SettingError, rule
 
 
 class ConfigError(ValueError):
@@ -46,6 +46,10 @@ Number = Annotated[float, Interval(ge=-1e9, le=1e9)]
 Positive = Annotated[float, Interval(gt=0, le=1e9)]
 NotNegative = Annotated[float, Interval(ge=0, le=1e9)]
 Count = Annotated[int, Interval(ge=1, le=10**15)]
+_RANGE = rule(lambda row: row[0] <= row[1], "a factor, or the lowest and the highest one")
+Factor = Positive | Annotated[tuple[Positive, Positive], _RANGE]
+"""A factor, or the range from which one is drawn for every episode."""
+FactorOrZero = NotNegative | Annotated[tuple[NotNegative, NotNegative], _RANGE]
 
 
 class Key(NamedTuple):

@@ -15,8 +15,9 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.keys import require_integer
-from safe_rl.envs.physics import Physics
+from safe_rl.envs.keys import ConfigError, require_integer
+from safe_rl.envs.physics import BatchPhysics, Physics
+from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
 
 
 class SimulatedEnv(ConstrainedEnv):
@@ -45,6 +46,9 @@ class SimulatedEnv(ConstrainedEnv):
     #: Whether every world has begun an episode; from then on this stays True.
     _all_begun = False
 
+    #: Draws factors on the dynamics for every episode, if the configuration has a range of them.
+    _dynamics: DrawnDynamics | None = None
+
     config: Any
     #: Draws the worlds, with `frames` as in `WorldRenderer`; a cached property.
     _renderer: Any
@@ -57,6 +61,19 @@ class SimulatedEnv(ConstrainedEnv):
         require_integer("num_threads", num_threads, lowest=0)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self._physics_settings: tuple[Any, ...] = (num_threads,)
+
+    def _draw_dynamics(self, model: mujoco.MjModel, bodies: slice) -> None:
+        """Prepare the drawing of factors; `bodies` are the ids of the robot's bodies."""
+        scales = {key: getattr(self.config, key) for key in SCALES}
+        ranges = {key: value for key, value in scales.items() if isinstance(value, tuple)}
+        if not ranges:
+            return
+        if not isinstance(self._physics, BatchPhysics):
+            raise ConfigError(
+                f"'{next(iter(ranges))}' is a range, which 'physics' warp does not have: use "
+                "'physics' cpu, or one factor."
+            )
+        self._dynamics = self._physics.draw_dynamics(model, ranges, bodies)
 
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
@@ -126,6 +143,8 @@ class SimulatedEnv(ConstrainedEnv):
             mask = torch.ones_like(self._begun)
         mask = mask.reshape(self.batch_size).to(self._physics.device)
         self._episode += mask
+        if self._dynamics is not None:
+            self._dynamics.draw(rng.fold(self._row_seed, self._episode), mask)
         self._begin(mask)
         self._has_cost &= ~mask
         self._begun |= mask
@@ -190,6 +209,8 @@ class SimulatedEnv(ConstrainedEnv):
         """Return a copy of the state, a TensorDict [N]: it determines all later steps and draws."""
         state = self._read_state()
         state["seed"], state["episode"] = self._row_seed.clone(), self._episode.clone()
+        if self._dynamics is not None:
+            state["dynamics"] = self._dynamics.factors.clone()
         return state
 
     @torch.no_grad()
@@ -203,6 +224,8 @@ class SimulatedEnv(ConstrainedEnv):
             KeyError: If a key is missing.
             ValueError: If a shape, a type or a value does not fit.
         """
+        if self._dynamics is not None and "dynamics" in state:
+            self._dynamics.set(state["dynamics"], torch.ones_like(self._begun))
         self._write_state(state)
         self._row_seed = state.get("seed", self._row_seed).clone()
         self._episode = state.get("episode", self._episode).clone()
@@ -285,7 +308,7 @@ def check_state(expected: TensorDictBase, state: TensorDictBase, optional: Colle
     """
     for key, value in expected.items():
         if key not in state:
-            if key not in optional:
+            if key not in (*optional, "dynamics"):
                 needed = sorted(set(expected.keys()) - set(optional))
                 raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
             continue

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from safe_rl.envs import ConfigError, SafetyGymEnv
+from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.velocity.runner import ASSETS
@@ -90,3 +90,63 @@ def test_muscles_have_no_strength_to_multiply(tmp_path):
     SafetyGymEnv({**keys, "mass_scale": 2.0}, 1)
     with pytest.raises(ConfigError, match="'strength_scale' is for actuators"):
         SafetyGymEnv({**keys, "strength_scale": 2.0}, 1)
+
+
+RANGES = {
+    "mass_scale": (0.5, 2.0),
+    "friction_scale": (0.5, 1.5),
+    "damping_scale": (0.5, 2.0),
+    "strength_scale": (0.7, 1.3),
+}
+
+
+def observations(env, state, actions):
+    env.set_state(state)
+    steps = [env.step(state.empty().set("action", action)) for action in actions]
+    return torch.stack([step["next", "observation"] for step in steps])
+
+
+@pytest.mark.parametrize("name", ["CarGoal1", "DoggoGoal1", "SafeAntVelocity"])
+def test_a_world_with_drawn_factors_moves_as_an_environment_with_these_factors(name):
+    drawn = make_env(name, num_envs=3, seed=0, **RANGES)
+    drawn.reset()
+    state = drawn.get_state()
+    actions = 2 * torch.rand(10, *drawn.action_spec.shape) - 1
+    moved = observations(drawn, state, actions)
+    for row, factors in enumerate(state["dynamics"].tolist()):
+        one = make_env(name, num_envs=1, seed=0, **dict(zip(RANGES, factors, strict=True)))
+        alone = observations(one, state[row : row + 1].exclude("dynamics"), actions[:, row, None])
+        assert torch.equal(alone[:, 0], moved[:, row])
+    as_it_was = make_env(name, num_envs=3, seed=0)
+    assert not torch.equal(observations(as_it_was, state.exclude("dynamics"), actions), moved)
+
+
+def test_every_episode_draws_its_factors_within_their_ranges_whatever_the_number_of_worlds():
+    keys = {**RANGES, "num_steps": 2}
+    env, fewer = (make_env("CarGoal1", num_envs=number, seed=3, **keys) for number in (50, 2))
+    episodes = []
+    for _ in range(3):
+        for each in (env, fewer):
+            each.reset()
+        episodes.append(env.get_state()["dynamics"])
+        assert torch.equal(episodes[-1][:2], fewer.get_state()["dynamics"])
+    low, high = torch.tensor([*RANGES.values()], dtype=torch.float64).T
+    factors = torch.cat(episodes)
+    assert len(factors.unique(dim=0)) == len(factors)
+    assert ((factors >= low) & (factors <= high)).all()
+    mean, std = (low + high) / 2, (high - low) / 12**0.5
+    assert ((factors.mean(0) - mean).abs() < 4 * std / len(factors) ** 0.5).all()
+    assert (factors.std(0) / std - 1).abs().max() < 0.15
+
+
+def test_a_range_that_cannot_be_drawn_from_is_refused():
+    with pytest.raises(ConfigError, match="'mass_scale' is a range, which 'physics' warp"):
+        make_env("PointGoal1", mass_scale=[0.5, 2.0], physics="warp")
+    with pytest.raises(ConfigError, match="a factor, or the lowest and the highest one"):
+        make_env("PointGoal1", mass_scale=[2.0, 0.5])
+    env = make_env("PointGoal1", mass_scale=[0.5, 2.0])
+    env.reset()
+    state = env.get_state()
+    state["dynamics"] = torch.ones(1, 2)
+    with pytest.raises(ValueError, match="State 'dynamics' must have shape"):
+        env.set_state(state)

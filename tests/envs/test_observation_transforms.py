@@ -51,6 +51,18 @@ def test_only_what_is_named_is_noisy_flat_or_not():
         assert torch.equal(entries[name].flatten(1), now[:, columns]), name
 
 
+def test_every_episode_draws_the_strength_of_its_noise_from_a_range():
+    noisy, exact = (
+        make_env("PointGoal1", num_envs=50, seed=0, transforms=named)
+        for named in ({"noise": SensorNoise([0.1, 0.3])}, {})
+    )
+    noise = noisy.reset()["observation"] - exact.reset()["observation"]
+    std = noise.std(-1)
+    assert 0.07 < std.min() < 0.15 < 0.25 < std.max() < 0.4
+    with pytest.raises(ValueError, match=r"std=.*the lowest and the highest value"):
+        SensorNoise([0.3, 0.1])
+
+
 class Film(gymnasium.Env):
     """Observes a picture and nothing else."""
 

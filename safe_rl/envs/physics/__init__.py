@@ -16,6 +16,8 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
+from safe_rl.envs.physics.dynamics import DrawnDynamics
+
 STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
 """Tensors of the state, besides that of actuators and sensors."""
 ACTUATOR_STATE = ("act", "history")
@@ -199,6 +201,12 @@ class BatchPhysics(Physics):
         self._with_sensors = int(model.opt.disableflags)
         self._warnings = np.zeros_like(self._batch.warning)
         self._num_failures, self._all_failed = 0, 0
+
+    def draw_dynamics(
+        self, model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]], bodies: slice
+    ) -> DrawnDynamics:
+        """Give every simulation dynamics of its own, see `DrawnDynamics`."""
+        return DrawnDynamics(model, self._batch, ranges, bodies)
 
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` to the model's initial state, see `Physics`."""

@@ -111,8 +111,7 @@ def _compile(
             "If a size is wrong, correct the Geoms of your elements."
         ) from error
     scales = {name: getattr(config, name) for name in SCALES}
-    if any(factor != 1.0 for factor in scales.values()):
-        scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
+    scale_dynamics(model, scales, slice(1, 1 + robot.num_bodies))
     return _index(config, model, robot, present, guided, placed, contact_names)
 
 

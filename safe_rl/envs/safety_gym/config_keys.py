@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval, MinLen
 
 from safe_rl.checks import Share, Text, rule
-from safe_rl.envs.keys import Count, NotNegative, Number, Positive
+from safe_rl.envs.keys import Count, Factor, FactorOrZero, NotNegative, Number, Positive
 
 LARGEST_SEED = 2**62  # of layouts; layout seeds are hashed as 64-bit integers
 
@@ -87,11 +87,11 @@ class Keys:
     robot_keepout: Annotated[NotNegative, _KEEPOUT] = 0.4
     robot_rot: Annotated[Number | None, "yaw at the start; None: uniform"] = None
 
-    # dynamics
-    mass_scale: Annotated[Positive, "factor on the robot's masses and inertias"] = 1.0
-    friction_scale: Annotated[Positive, "factor on the friction of all surfaces"] = 1.0
-    damping_scale: Annotated[NotNegative, "factor on the damping of the robot's joints"] = 1.0
-    strength_scale: Annotated[NotNegative, "factor on the forces of its actuators"] = 1.0
+    # dynamics; two numbers: the range of a factor that is drawn for every episode
+    mass_scale: Annotated[Factor, "factor on the robot's masses and inertias"] = 1.0
+    friction_scale: Annotated[Factor, "factor on the friction of all surfaces"] = 1.0
+    damping_scale: Annotated[FactorOrZero, "factor on the damping of the robot's joints"] = 1.0
+    strength_scale: Annotated[FactorOrZero, "factor on the forces of its actuators"] = 1.0
 
     # observations
     observation_flatten: Annotated[bool, "True: one vector; False: an entry per component"] = True

@@ -58,8 +58,9 @@ class SafetyGymEnv(SimulatedEnv):
 
     A state has `qpos`, `qvel`, `qacc_warmstart`, `time`, `goal_pos` [N, 3], `goal_button`,
     `buttons_timer`, `step_count`, and keys that may be missing in a state that is set: `ctrl`,
-    `act`, `history`, `target_quat`, `layout`, `start_pose`, `fixed_layout`, `seed`, `episode`, and
-    with `observe_privileged` also `last_costs`, `cost_traces` and `since_goal`.
+    `act`, `history`, `target_quat`, `layout`, `start_pose`, `fixed_layout`, `seed`, `episode`, with
+    `observe_privileged` also `last_costs`, `cost_traces` and `since_goal`, and with ranges of
+    factors on the dynamics also `dynamics`, the factors of every world.
     `set_state` wakes sleeping bodies; with `sleep` False the continuation is identical to the last
     digit.
 
@@ -126,6 +127,7 @@ class SafetyGymEnv(SimulatedEnv):
             self._remembered = self._privileged.past
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
+        self._draw_dynamics(scene.model, slice(1, scene.free_bodies.start))
         self._announce(scene.model, observed, highest, seed)
 
     def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:

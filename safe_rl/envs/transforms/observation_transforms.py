@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from safe_rl.checks import Text, Weight
+from safe_rl.checks import Text, Weight, rule
 from safe_rl.envs import rng
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.transforms.environment import (
@@ -24,6 +24,12 @@ from safe_rl.envs.transforms.environment import (
 )
 from safe_rl.naming import did_you_mean
 
+_Range = Annotated[
+    Sequence[NonNegativeFloat],
+    rule(lambda row: len(row) == 2 and row[0] <= row[1], "the lowest and the highest value"),
+]
+_STD = -1  # differs from all step numbers, which are in the same place of a key
+
 
 class SensorNoise(ConstraintTransform):
     """Add normally distributed noise to observations, also in evaluation.
@@ -32,7 +38,8 @@ class SensorNoise(ConstraintTransform):
     resumed runs are identical, and rows are independent. Pictures of integers are not changed.
 
     Args:
-        std: Standard deviation of the noise, in the units of the observation.
+        std: Standard deviation of the noise, in the units of the observation; or the lowest and
+            the highest one, from which every episode draws its own.
         components: Names of the noisy components, as in `observation_layout`; None: all.
 
     Examples:
@@ -43,7 +50,11 @@ class SensorNoise(ConstraintTransform):
         torch.Size([2, 60])
     """
 
-    def __init__(self, std: NonNegativeFloat, components: Sequence[Text] | None = None) -> None:
+    def __init__(
+        self,
+        std: NonNegativeFloat | _Range,
+        components: Sequence[Text] | None = None,
+    ) -> None:
         super().__init__()
         self._std = std
         self._components = None if components is None else list(components)
@@ -115,8 +126,14 @@ class SensorNoise(ConstraintTransform):
         if self._components is not None and not whole:
             layout = self._layout or self.container.observation_layout
             columns = torch.cat([columns[layout[name]] for name in self._components])
-        noise = self._std * rng.normal(key, step, columns + first)
+        noise = self._std_of(key) * rng.normal(key, step, columns + first)
         return flat.index_add(-1, columns, noise.to(flat.dtype)).reshape(value.shape)
+
+    def _std_of(self, key: Tensor) -> Tensor | float:
+        if isinstance(self._std, int | float):
+            return self._std
+        low, high = self._std
+        return low + (high - low) * rng.uniform(key, _STD)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Remove the bounds."""

@@ -19,9 +19,10 @@ from safe_rl.checks import rule
 from safe_rl.envs.keys import (
     ConfigError,
     Count,
+    Factor,
+    FactorOrZero,
     NotNegative,
     Number,
-    Positive,
     checked,
     on_cpu_only,
 )
@@ -124,11 +125,12 @@ class VelocityConfig:
     velocity_threshold: Annotated[NotNegative, "speed above which a step costs 1 [m/s]"] = _OF_ROBOT
     num_steps: Annotated[Count, "steps after which an episode is truncated"] = 1000
     frame_skip: Annotated[Count, "substeps per step"] = _OF_ROBOT
-    # Factors on the values in Gymnasium's file. Friction cannot be 0 in MuJoCo.
-    mass_scale: Annotated[Positive, "factor on masses and inertias"] = 1.0
-    friction_scale: Annotated[Positive, "factor on the friction of all surfaces"] = 1.0
-    damping_scale: Annotated[NotNegative, "factor on the damping of joints"] = 1.0
-    strength_scale: Annotated[NotNegative, "factor on the forces of actuators"] = 1.0
+    # Factors on the values in Gymnasium's file; two numbers: the range of one that is drawn for
+    # every episode. Friction cannot be 0 in MuJoCo.
+    mass_scale: Annotated[Factor, "factor on masses and inertias"] = 1.0
+    friction_scale: Annotated[Factor, "factor on the friction of all surfaces"] = 1.0
+    damping_scale: Annotated[FactorOrZero, "factor on the damping of joints"] = 1.0
+    strength_scale: Annotated[FactorOrZero, "factor on the forces of actuators"] = 1.0
     reset_noise_scale: Annotated[
         NotNegative, "noise of initial positions [m, rad] and velocities [m/s, rad/s]"
     ] = _OF_ROBOT

@@ -95,6 +95,7 @@ class VelocityEnv(SimulatedEnv):
         self._step_count = torch.zeros(num_envs, dtype=torch.int64)
         self._starts = Starts(self.config, self._model, num_envs)
         observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
+        self._draw_dynamics(self._model, slice(1, self._model.nbody))
         self._announce(self._model, observed, highest=1.0, seed=seed)
 
     def _begin(self, mask: Tensor) -> None:
