@@ -17,14 +17,14 @@ import warnings
 from collections.abc import Mapping
 
 import torch
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
 from torchrl.envs import EnvBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms import PPOTrainer
-from torchrl.trainers.trainers import ValueEstimatorHook
+from torchrl.trainers.trainers import OptimizationStepper, ValueEstimatorHook
 
 from safe_rl.algorithms import Constraints, CPOStep, MinibatchUpdate
-from safe_rl.algorithms.torchrl_trainers import ConstraintHook, UpdateStepper
 from safe_rl.collectors import EpisodeAccounting, make_collector
 from safe_rl.envs import make_env
 from safe_rl.models import make_actor, make_critic
@@ -57,6 +57,42 @@ class Parts:
         )
         self.accounting = EpisodeAccounting(env.batch_size.numel(), keys, device=env.device)
         self.collector = make_collector(env, self.actor, frames_per_batch=frames_per_batch)
+        self.constraints = Constraints(limits)
+
+    def add_limits(
+        self,
+        trainer: Trainer,
+        multiplier: LagrangeMultiplier | None = None,
+        loss: PPOLagrangianLoss | None = None,
+    ) -> None:
+        """Let a trainer update limits, multiplier and loss with every batch, and log them."""
+
+        def update(batch: TensorDictBase) -> TensorDictBase:
+            episodes = self.accounting.update(batch)
+            self.limits = self.constraints.update(batch, episodes)
+            if multiplier is not None and loss is not None:
+                multiplier.update(self.limits)
+                loss.prepare(batch, self.limits)
+            self.row = episodes.scalars() | self.constraints.columns(self.limits, multiplier)
+            return batch
+
+        trainer.register_op("batch_process", update)
+        trainer.register_op("pre_steps_log", lambda batch: self.row)
+
+
+class CPOStepper(OptimizationStepper):
+    """A CPO step, and a fit of the critics, on the whole batch of a trainer."""
+
+    def __init__(self, parts: Parts, policy_update: CPOStep, critic_update: MinibatchUpdate):
+        self.parts, self.policy_update, self.critic_update = parts, policy_update, critic_update
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDict:
+        """Improve the policy, then the critics."""
+        row: dict[str, float] = {}
+        for name, value in self.policy_update(sub_batch, self.parts.limits).items():
+            row |= self.parts.constraints.column(name, torch.as_tensor(value))
+        self.critic_update(sub_batch)
+        return TensorDict({name: torch.as_tensor(value) for name, value in row.items()})
 
 
 def ppo_lagrangian_trainer(
@@ -86,8 +122,7 @@ def ppo_lagrangian_trainer(
             gae=parts.advantages,
             progress_bar=False,
         )
-    told = {"multiplier": multiplier, "loss": policy_loss}
-    ConstraintHook(Constraints(limits), parts.accounting, **told).register(trainer)
+    parts.add_limits(trainer, multiplier, policy_loss)
     return trainer
 
 
@@ -96,7 +131,6 @@ def cpo_trainer(
 ) -> Trainer:
     """TorchRL's trainer with a CPO step in place of its optimiser."""
     parts = Parts(env, limits, frames_per_batch)
-    hook = ConstraintHook(Constraints(limits), parts.accounting)
     policy_loss = CPOLoss(parts.actor, entropy_coeff=0.0)
     step = CPOStep(
         policy_loss,
@@ -119,10 +153,10 @@ def cpo_trainer(
         frame_skip=1,
         optim_steps_per_batch=1,
         loss_module=ActorCriticLoss(policy_loss, parts.critic_loss, critic_coeff=1.0),
-        optimization_stepper=UpdateStepper(step, critic_update, hook),
+        optimization_stepper=CPOStepper(parts, step, critic_update),
         progress_bar=False,
     )
-    hook.register(trainer)
+    parts.add_limits(trainer)
     ValueEstimatorHook(parts.advantages).register(trainer)
     return trainer
 

@@ -1,22 +1,15 @@
 """TorchRL's trainers with our parts: the example trains, and the parts do what they say."""
 
-from unittest.mock import Mock
-
 import pytest
 import torch
 import torchrl_trainer as example
 from point_mass import PointMass
 from samples import make_actor, make_batch, make_critic, perturb
-from tensordict import TensorDict
 
-from safe_rl.algorithms import Constraints
-from safe_rl.algorithms.torchrl_trainers import ConstraintHook
-from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import (
     ActorCriticLoss,
     CostGAE,
     CriticLoss,
-    CVaR,
     JointAdvantages,
     LagrangeMultiplier,
     LimitState,
@@ -117,38 +110,6 @@ def test_keys_reach_the_part_that_reads_them():
     assert ("next", "r") in estimator.in_keys
     assert cost.reward_keys == ["cost"]
     assert (cost.tensor_keys.done, cost.tensor_keys.terminated) == ("d", "t")
-
-
-def costly_batch(cost, done=True):
-    step = {"reward": torch.ones(1, 4, 1), "cost": torch.full((1, 4, 1), cost)}
-    step["done"] = torch.tensor([[[False], [False], [False], [done]]])
-    return TensorDict({"next": step}, [1, 4])
-
-
-def test_the_hook_continues_from_its_state():
-    def make():
-        multiplier = LagrangeMultiplier({"cost": 1.0}, init=1.0, lr=0.1)
-        accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
-        return ConstraintHook(Constraints({"cost": 1.0}), accounting, multiplier=multiplier)
-
-    whole, first, second = make(), make(), make()
-    batches = [costly_batch(1.0), costly_batch(2.0, done=False), costly_batch(0.5)]
-    rows = [whole.log(whole(batch)) for batch in batches]
-    for batch in batches[:2]:
-        first(batch)
-    second.load_state_dict(first.state_dict())
-    assert second.log(second(batches[2])) == rows[2]
-    assert rows[2]["episode_cost"] == 10
-    # a batch of 4 steps, shorter than episodes of 8 by now: what they cost at its rate
-    assert rows[2]["violation_cost"] == 0.5 * 8 - 1
-
-
-def test_a_risk_measure_is_refused():
-    accounting = EpisodeAccounting(num_envs=1, cost_keys=["cost"])
-    risk = CVaR(torch.tensor([1.0]), tail=0.1, window=20, ramp_start=0, ramp_steps=0)
-    constraints = Constraints({"cost": 1.0}, tracker=Mock(), risk=risk)
-    with pytest.raises(TypeError, match=r"takes no risk measure.*risk="):
-        ConstraintHook(constraints, accounting)
 
 
 def test_the_command_of_the_example(capsys, monkeypatch):
