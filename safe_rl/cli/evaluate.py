@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from safe_rl.cli.options import OptionError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
+from safe_rl.runs.run import Run
+
+if TYPE_CHECKING:
+    from safe_rl.evaluation import Evaluation
+    from safe_rl.evaluation.variations import Varied
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
@@ -17,10 +23,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluat
 
 def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
     """Evaluate or certify a run, or run it under variations, and print the results."""
-    # imported here: help and errors about options do not need torch
-    from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
-    from safe_rl.evaluation.policies import find_run
-    from safe_rl.runs.run import Run
+    from safe_rl.evaluation.policies import find_run  # with torch: help does not need it
 
     directory = find_run(words[0])
     check_imports(Run(directory).config, modules, directory)
@@ -28,11 +31,48 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
     if options.certify:
         return _certify(directory, options)
     if options.variations is not None:
-        found, picture = evaluate_varied(directory, options, progress=True)
-        print(found, f"wrote {found.file}", f"wrote {picture}", sep="\n")
+        varied, picture = evaluate_varied(directory, options, progress=True)
+        print(varied, f"wrote {varied.file}", f"wrote {picture}", sep="\n")
     else:
         print(evaluate_run(directory, options, progress=True))
     return 0
+
+
+def evaluate_run(
+    directory: Path, options: EvaluationOptions, *, progress: bool = False
+) -> Evaluation:
+    """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark.
+
+    Raises:
+        ValueError: If the options ask for a certificate or for variations.
+    """
+    from safe_rl.cli.report import suite
+    from safe_rl.evaluation import evaluate
+    from safe_rl.evaluation.loading import maker_of
+    from safe_rl.evaluation.policies import writable_copy
+
+    directory = writable_copy(directory)
+    if options.certify or options.variations is not None:
+        raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
+    make = maker_of(directory)
+    return evaluate(directory, options, make_env=make, suite=suite(), progress=progress)
+
+
+def evaluate_varied(
+    directory: Path, options: EvaluationOptions, *, progress: bool = False
+) -> tuple[Varied, Path]:
+    """Run a policy under ``options.variations``; return the results, and the path of a picture."""
+    from safe_rl.evaluation.loading import maker_of
+    from safe_rl.evaluation.policies import writable_copy
+    from safe_rl.evaluation.variations import evaluate_variations
+    from safe_rl.reporting.figures import draw_variations
+
+    directory = writable_copy(directory)
+    make = maker_of(directory)
+    varied = evaluate_variations(directory, options, make_env=make, progress=progress)
+    picture = Run(directory).variations_file(options.name, "png")
+    draw_variations(varied.rows, varied.cost_limits, picture)
+    return varied, picture
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:

@@ -7,7 +7,9 @@ dataclass: pydantic checks them by their annotations, and their help texts make 
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -17,6 +19,7 @@ from typing import (
     Annotated,
     Any,
     Literal,
+    NoReturn,
     TypeVar,
     Union,
     get_args,
@@ -30,7 +33,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.checks import check_value
-from safe_rl.cli.terminal import end_by_interrupt, keep_streams
+from safe_rl.cli.user_code import split_imports
 from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Options = TypeVar("Options", bound="DataclassInstance")
+_FORMAT = warnings.formatwarning
 
 
 class OptionError(ValueError):
@@ -146,13 +150,11 @@ def run_command(
     words = sys.argv[1:] if arguments is None else list(arguments)
     places = sum(word[0].isupper() for word in command.split())
     is_help = words[:1] in (["-h"], ["--help"])
-    imports = [word for word in words if word.startswith("import=")]
-    words = [word for word in words if word not in imports]
+    modules, words = split_imports(words)
     if is_help or len(words) < places:
         print(usage(command, schema))
         return 0 if is_help else 2
     try:
-        modules = [module for word in imports for module in _modules(word)] if imports else None
         return work(words[:places], read_options(words[places:], schema), modules)
     except (
         ValueError,
@@ -170,7 +172,25 @@ def run_command(
         end_by_interrupt()
 
 
-def _modules(word: str) -> list[str]:
-    """The modules of ``import=my_module`` or ``import=[first,second]``."""
-    text = word.partition("=")[2]
-    return list(_value(word)) if text.startswith("[") else [text]
+def keep_streams() -> None:
+    """Let the command print, whatever its streams are.
+
+    A stream that is closed takes what is written, and characters that the encoding lacks, such as ≤
+    in ASCII, are escaped: neither may end a run or change the exit status. Warnings, which may
+    quote files of others, are shown without control characters.
+    """
+    warnings.formatwarning = lambda *parts, **names: printable(_FORMAT(*parts, **names))
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def end_by_interrupt() -> NoReturn:
+    """Say that Ctrl-C was pressed, and end by its signal: a shell's loop over commands ends too."""
+    print("Interrupted.", file=sys.stderr)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    os.kill(os.getpid(), signal.SIGINT)
+    raise KeyboardInterrupt

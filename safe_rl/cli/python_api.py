@@ -22,11 +22,17 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
-from safe_rl.cli.composing import check_risk, compose_run, overrides_of
+from safe_rl.cli.composing import (
+    RESUMED,
+    check_risk,
+    compose_run,
+    overrides_of,
+    read_resumed,
+    refuse_changes,
+)
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.evaluating import evaluate_run, evaluate_varied
+from safe_rl.cli.evaluate import evaluate_run, evaluate_varied
 from safe_rl.cli.options import make_options
-from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
 from safe_rl.evaluation.episodes import default_seed

@@ -23,11 +23,18 @@ from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.cli.composing import check_risk, explain, name_choices, overrides_of
+from safe_rl.cli.composing import (
+    RESUMED,
+    check_risk,
+    explain,
+    name_choices,
+    overrides_of,
+    read_resumed,
+    refuse_changes,
+)
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.resuming import RESUMED, read_resumed, refuse_changes
+from safe_rl.cli.options import end_by_interrupt, keep_streams
 from safe_rl.cli.sweeps import run_in_sweep
-from safe_rl.cli.terminal import end_by_interrupt, keep_streams
 from safe_rl.cli.user_code import import_modules, split_imports, take_word
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF, printable

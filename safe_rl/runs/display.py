@@ -20,8 +20,6 @@ from safe_rl.runs.outcome import final_figures, final_rows, measured
 LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
 """Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 
-_RATE_STEPS = 1000
-
 
 class ProgressBar:
     """A bar with steps, steps per second, return, and costs with their present limits.
@@ -38,7 +36,6 @@ class ProgressBar:
         total: int,
         begun: int,
         limits: Mapping[str, float],
-        episode_length: int,
         measure: str = "mean",
     ) -> None:
         self._name = os.path.relpath(directory)
@@ -49,12 +46,11 @@ class ProgressBar:
             total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
             smoothing=0.1, **options,
         )  # fmt: skip
-        self._limits, self._episode_length = limits, episode_length
-        self._measure = measure
+        self._limits, self._measure = limits, measure
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, given as its row of the table."""
-        figures = shown(row, self._limits, self._episode_length, self._measure)
+        figures = shown(row, self._limits, self._measure)
         self._bar.set_postfix(figures, refresh=False)
         self._bar.update(int(row["steps"]) - self._bar.n)
         if monotonic() - self._printed >= self._seconds:
@@ -70,16 +66,12 @@ class ProgressBar:
 
 
 def shown(
-    row: Mapping[str, float],
-    limits: Mapping[str, float],
-    episode_length: int = _RATE_STEPS,
-    measure: str = "mean",
+    row: Mapping[str, float], limits: Mapping[str, float], measure: str = "mean"
 ) -> dict[str, str]:
     """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
 
-    Return and costs are means over the episodes that ended in the epoch. If none ended, they are
-    those of all steps so far, per 1,000 steps. While an algorithm lowers its limit, the word
-    "target" precedes the present one.
+    Return and costs are means over the episodes that ended in the epoch. While an algorithm lowers
+    its limit, the word "target" precedes the present one.
 
     Examples:
         >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
@@ -87,40 +79,29 @@ def shown(
         {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
         >>> shown(row | {"estimate_cost": 31.0, "target_cost": 29.0}, {"cost": 25.0})["cost"]
         '30.0/target 29'
-        >>> shown({"episode_return": math.nan, "steps": 400, "cost_rate": 0.06}, {"cost": 25.0})
-        {'cost per 1,000 steps': '60.0/25'}
     """
-    figures = {}
-    costs = list(limits) or ["cost"]
     if math.isnan(row["episode_return"]):
-        unit, scale = f" per {_RATE_STEPS:,} steps", _RATE_STEPS / episode_length
-        if "reward_rate" in row:
-            figures[f"return{unit}"] = f"{_RATE_STEPS * row['reward_rate']:.2f}"
-        values = {key: _RATE_STEPS * row[f"{key}_rate"] for key in costs}
-    else:
-        unit, scale = "", 1.0
-        figures["return"] = f"{row['episode_return']:.2f}"
-        values = {key: measured(row, key, limits.get(key), measure) for key in costs}
-    for key, value in values.items():
-        figures[f"{key}{unit}"] = f"{value:.1f}{_present_limit(row, key, limits, scale)}"
+        return {"episodes": "none has ended"}
+    figures = {"return": f"{row['episode_return']:.2f}"}
+    for key in list(limits) or ["cost"]:
+        value = measured(row, key, limits.get(key), measure)
+        figures[key] = f"{value:.1f}{_present_limit(row, key, limits)}"
     multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
     if multipliers:
         figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
     return figures
 
 
-def _present_limit(
-    row: Mapping[str, float], key: str, limits: Mapping[str, float], scale: float
-) -> str:
+def _present_limit(row: Mapping[str, float], key: str, limits: Mapping[str, float]) -> str:
     """The present limit of a cost, to follow its figure."""
     if key not in limits:
         return ""
     target, limit = row.get(f"target_{key}", -math.inf), limits[key]
     if target <= limit:
-        return f"/{limit * scale:g}"
+        return f"/{limit:g}"
     if target > row.get(f"estimate_{key}", math.inf):
         return " (no limit yet)"
-    return f"/target {target * scale:.3g}"
+    return f"/target {target:.3g}"
 
 
 def outcome_line(
@@ -136,30 +117,21 @@ def outcome_line(
         >>> table |= {"episode_return": [1.0, 2.0], "episode_cost": [30.0, 20.0]}
         >>> outcome_line(table, {"cost": 25.0}, 1000)
         'Return 1.50, cost 25.0 (limit 25) per episode, mean of steps 1 to 2,000; 500 steps/s'
-        >>> table |= {"episode_return": [math.nan] * 2, "reward_rate": [0.001, 0.002]}
-        >>> outcome_line(table, {"cost": 25.0}, 1000).partition(";")[0]
-        'No episode of 1,000 steps has ended: return 2.00, cost 30.0 (limit 25) per 1,000 steps'
+        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, 1000)
+        'No episode of 1,000 steps has ended; 500 steps/s'
     """
     keys = list(limits) or ["cost"]
-    final = final_figures(table, keys)
-    rows = final_rows(table)
-    if rows:
-        begin = 0 if rows[0] == 0 else table["steps"][rows[0] - 1]
-        what = f"Return {final['episode_return']:.2f}"
-        values = {key: _final_cost(final, key, limits.get(key), measure) for key in keys}
-        over = f"per episode, mean of steps {begin + 1:,.0f} to {table['steps'][rows[-1]]:,.0f}"
-        scale = 1.0
-    else:
-        scale = _RATE_STEPS / episode_length
-        what = f"No episode of {episode_length:,} steps has ended"
-        if "reward_rate" in table:
-            what += f": return {_RATE_STEPS * table['reward_rate'][-1]:.2f}"
-        values = {key: f"{_RATE_STEPS * final[f'{key}_rate']:.1f}" for key in keys}
-        over = f"per {_RATE_STEPS:,} steps"
-    for key, value in values.items():
-        limit = f" (limit {limits[key] * scale:g})" if key in limits else ""
-        what += f", {key} {value}{limit}"
-    return f"{what} {over}; {final['steps_per_second']:,.0f} steps/s"
+    final, rows = final_figures(table, keys), final_rows(table)
+    speed = f"{final['steps_per_second']:,.0f} steps/s"
+    if not rows:
+        return f"No episode of {episode_length:,} steps has ended; {speed}"
+    what = f"Return {final['episode_return']:.2f}"
+    for key in keys:
+        limit = f" (limit {limits[key]:g})" if key in limits else ""
+        what += f", {key} {_final_cost(final, key, limits.get(key), measure)}{limit}"
+    begin = 0 if rows[0] == 0 else table["steps"][rows[0] - 1]
+    span = f"steps {begin + 1:,.0f} to {table['steps'][rows[-1]]:,.0f}"
+    return f"{what} per episode, mean of {span}; {speed}"
 
 
 def _final_cost(final: Mapping[str, float], key: str, limit: float | None, measure: str) -> str:

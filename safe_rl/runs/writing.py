@@ -94,9 +94,7 @@ class RunWriter:
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch
-            self._bar = ProgressBar(
-                self.directory, total, steps, self._cost_limits, self._episode_length, self._measure
-            )
+            self._bar = ProgressBar(self.directory, total, steps, self._cost_limits, self._measure)
             opened.callback(self._bar.close)
             yield
             self._save_config()

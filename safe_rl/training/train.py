@@ -106,7 +106,7 @@ def train(
                 say(
                     f"No episode will end: {config.num_envs} environments with episodes of "
                     f"{trainer.episode_length:,} steps end the first ones after {first:,} frames. "
-                    "Set frames=… or num_envs=…; until then there are rates per 1,000 steps."
+                    "Set frames=… or num_envs=…"
                 )
             if hydra is not None and not (continues and run.notes_folder.exists()):
                 _write_notes(run, config, hydra)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_rl.checks import SettingError
-from safe_rl.cli.evaluating import evaluate_run
+from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.options import OptionError, make_options, read_options, run_command, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra

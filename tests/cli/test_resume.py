@@ -5,8 +5,8 @@ from commands import composed
 from omegaconf import OmegaConf
 from run_configs import point_mass_config
 
+from safe_rl.cli.composing import read_resumed, refuse_changes
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.resuming import read_resumed, refuse_changes
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
 

@@ -88,7 +88,7 @@ def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(LINE_SECONDS, "0")
     row = {"steps": 250, "steps_per_second": 5000.0, "episode_return": 1.5, "episode_cost": 30.0}
-    bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0}, 1000)
+    bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0})
     bar.add({**row, "multiplier_cost": 0.5})
     bar.close()
     line = "seed0: 25% of 1,000 steps, 5,000 steps/s, return=1.50, cost=30.0/25, λ=0.5\n"

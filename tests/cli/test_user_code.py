@@ -9,7 +9,7 @@ from run_configs import point_mass_config
 
 from safe_rl import trust
 from safe_rl.cli import user_code
-from safe_rl.cli.resuming import read_resumed
+from safe_rl.cli.composing import read_resumed
 from safe_rl.cli.user_code import check_imports, import_modules, split_imports
 from safe_rl.envs import complete_env, make_env
 from safe_rl.runs.run import Run

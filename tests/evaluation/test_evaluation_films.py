@@ -9,7 +9,7 @@ from evaluated_runs import NUM_STEPS, options, skip_without_opengl
 from PIL import Image
 
 from safe_rl.cli import evaluating as command
-from safe_rl.cli.evaluating import evaluate_run as evaluate
+from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
 from safe_rl.envs.velocity import VelocityEnv

@@ -13,8 +13,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
-from safe_rl.cli.evaluate import main
-from safe_rl.cli.evaluating import evaluate_run
+from safe_rl.cli.evaluate import evaluate_run, main
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.variations import Variation, read_variations, varied
 from safe_rl.files import CONF, read_yaml

@@ -137,7 +137,7 @@ def test_a_risk_measure_is_what_is_held_against_the_limit(tmp_path, capsys):
     assert "cost 25.0, limited measure 88.0 (limit 25)" in writer.summary()
     with writer.writing(0):
         writer.add(row(1, NAN, NAN) | {"violation_cost": NAN})
-    assert "No episode of 1,000 steps has ended, cost 1.0 (limit 25) per 1,000" in writer.summary()
+    assert "No episode of 1,000 steps has ended" in writer.summary()
     assert "cost=89.0/25" in capsys.readouterr().err
 
 

@@ -12,7 +12,7 @@ from run_configs import assert_resumes_exactly, off_policy_config, point_mass_co
 from torchrl.envs.transforms import StepCounter
 
 from safe_rl.cli import evaluate
-from safe_rl.cli.evaluating import evaluate_run
+from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.loading import transforms_of
