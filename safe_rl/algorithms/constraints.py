@@ -43,7 +43,9 @@ class Constraints(Resumable):
 
     Attributes:
         keys: Keys of the k costs.
+        cost_limits: Cost key -> d.
         limits: Limits d, [k].
+        schedule: A sentence on when the limits begin to hold; empty if they do from the start.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -68,10 +70,15 @@ class Constraints(Resumable):
         device: torch.device | str | None = None,
     ) -> None:
         if risk is not None and tracker is None:
-            raise ValueError("Without a tracker, only the mean cost of an episode can be limited.")
-        self.keys = list(limits)
+            raise ValueError(
+                "risk: only the mean cost is limited by the episodes of a batch alone "
+                "(limits=null); other measures need limits, as in conf/algo/cpo.yaml."
+            )
+        self.keys, self.cost_limits = list(limits), dict(limits)
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.tracker, self.risk = tracker, risk
+        has_schedule = tracker is not None and bool(self.keys)
+        self.schedule = tracker.schedule if has_schedule else ""
         self._max_length = max_length
         # mean costs and length of episodes in the last batch in which an episode finished
         self._finished = torch.full_like(self.limits, torch.nan)
@@ -79,8 +86,8 @@ class Constraints(Resumable):
         self._penalised: PenalisedCosts | None = None
 
     @classmethod
-    def from_config(cls, config: DictConfig, env: EnvBase, limits: Mapping[str, float]) -> Self:
-        """Build constraints with the tracker and risk measure that a configuration names.
+    def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
+        """Build the constraints of a configuration; without any for an unconstrained algorithm.
 
         Lengths of episodes are in decisions (time steps of a batch), schedules in environment
         steps.
@@ -88,29 +95,25 @@ class Constraints(Resumable):
         Args:
             config: Configuration as composed from ``conf/``.
             env: Environment that has the costs.
-            limits: Cost key -> d, see `constrained_limits`.
 
         Raises:
-            ValueError: If a risk measure is named without a tracker.
+            ValueError: If a limit names no cost of the environment, a constrained algorithm has no
+                limit, or a risk measure is named without a tracker.
         """
-        tracker = risk = None
+        limits = check_cost_limits(config.cost_limits, env.cost_keys)
+        if config.algo.constrained and not limits:
+            raise ValueError(
+                f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
+                "cost_limits='{cost: 25}'. Without constraints use algo=ppo or algo=sac."
+            )
+        limits, tracker, risk = limits if config.algo.constrained else {}, None, None
         max_length = math.ceil(env.max_episode_steps / env.steps_per_decision)
         if limits:
             values = torch.tensor(list(limits.values()))
             known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
             risk = instantiate(config.get("risk"), known, cost_limits=values)
             tracker = instantiate(config.get("limits"), known, cost_limits=values)
-        if risk is not None and tracker is None:
-            raise ValueError(
-                "risk: only the mean cost is limited by the episodes of a batch alone "
-                "(limits=null); other measures need limits, as in conf/algo/cpo.yaml."
-            )
         return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
-
-    @property
-    def schedule(self) -> str:
-        """A sentence on when the limits begin to hold; empty if they do from the start."""
-        return self.tracker.schedule if self.tracker is not None and self.keys else ""
 
     @property
     def measured_limits(self) -> dict[NestedKey, float]:
@@ -129,9 +132,9 @@ class Constraints(Resumable):
         """
         if self.tracker is None:
             return self._compare_episodes(batch, episodes)
+        costs = torch.cat([batch["next", key] for key in self.keys], -1)
         if self.risk is not None:
-            self._penalise(batch, episodes)
-        costs = self._costs_of(batch)
+            self._penalise(batch, costs.cpu(), episodes)
         state = self.tracker.update(costs, episodes.decisions, self._penalised)
         return state.to(self.limits.device)
 
@@ -156,19 +159,15 @@ class Constraints(Resumable):
         is_new = goes_by_rate or episodes.num_episodes > 0
         return LimitState.of(cost=costs, limit=self.limits, length=length, is_new=is_new)
 
-    def _penalise(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> None:
-        """Write the costs of the risk measure below ``"next"``."""
+    def _penalise(self, batch: TensorDictBase, costs: Tensor, episodes: EpisodeStatistics) -> None:
+        """Write what the risk measure makes of the costs [N, T, k] below ``"next"``."""
         assert self.risk is not None
-        costs = self._costs_of(batch).cpu()
         ends = batch["next", "done"].squeeze(-1).cpu()
         before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
         finished = episodes.episode_costs(self.keys).cpu()
         self._penalised = self.risk(costs, ends, before.nan_to_num(0.0).to(costs), finished)
         device = batch.device or self.limits.device
         batch["next", PENALISED_COSTS] = self._penalised.costs.to(device)
-
-    def _costs_of(self, batch: TensorDictBase) -> Tensor:
-        return torch.cat([batch["next", key] for key in self.keys], -1)
 
     def record_prediction(self, state: LimitState, metrics: Mapping[str, Tensor]) -> None:
         """Store the change of J_c that an update's surrogates predict, if it reports them."""
@@ -229,23 +228,6 @@ class Constraints(Resumable):
         self.tracker.load_state_dict(state_dict["tracker"])
         if self.risk is not None:
             self.risk.load_state_dict(state_dict["risk"])
-
-
-def constrained_limits(config: DictConfig, env: EnvBase) -> dict[str, float]:
-    """Cost limits of a configuration's algorithm; empty if it keeps none.
-
-    Raises:
-        ValueError: If a limit names no cost of the environment, or the algorithm needs a limit.
-    """
-    limits = check_cost_limits(config.cost_limits, env.cost_keys)
-    if not config.algo.constrained:
-        return {}
-    if not limits:
-        raise ValueError(
-            f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
-            "cost_limits='{cost: 25}'. Without constraints use algo=ppo or algo=sac."
-        )
-    return limits
 
 
 def check_cost_limits(

@@ -5,7 +5,7 @@ In TorchRL all entries named ``loss_…`` are minimised; others are diagnostics.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from itertools import chain
 from typing import Any
@@ -129,34 +129,27 @@ class LossState:
         self._losses = dict(losses)
         self._saved_elsewhere = list(saved_elsewhere)
 
-    def __bool__(self) -> bool:
-        """Whether there is any such tensor."""
-        return bool(self._own())
-
     def state_dict(self) -> dict[str, Tensor]:
         """Copies, by the name of the loss and the tensor's name in it."""
-        return {name: tensor.detach().clone() for name, tensor in self._own().items()}
+        return {name: tensor.detach().clone() for name, tensor in self.tensors.items()}
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Load a :meth:`state_dict` in place, because an optimiser has the same tensors."""
-        for name, tensor in self._own().items():
+        for name, tensor in self.tensors.items():
             tensor.copy_(state_dict[name])
 
-    def _own(self) -> dict[str, Tensor]:
-        # at every call: a loss may replace a buffer
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors themselves; a loss may replace a buffer, so ask at every use."""
         modules = self._saved_elsewhere
-        known = {tensor.data_ptr() for module in modules for _, tensor in _tensors(module)}
+        known = {x.data_ptr() for part in modules for x in chain(part.parameters(), part.buffers())}
         return {
             f"{place}.{name}": tensor
             for place, loss in self._losses.items()
-            for name, tensor in _tensors(loss)
+            for name, tensor in chain(loss.named_parameters(), loss.named_buffers())
             if tensor.data_ptr() not in known and not _is_setting(name, loss)
         }
-
-
-def _tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    return chain(module.named_parameters(), module.named_buffers())
 
 
 def _is_setting(name: str, loss: nn.Module) -> bool:

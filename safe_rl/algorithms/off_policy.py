@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful, networks_of_target
-from safe_rl.algorithms.constraints import Constraints, constrained_limits
+from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
@@ -23,7 +23,6 @@ from safe_rl.models import ExploringPolicy, QEnsemble
 from safe_rl.models.bounded_actors import bounded_actions
 from safe_rl.models.encoders import (
     Codes,
-    Entry,
     Observed,
     check_encoders,
     critic_entries,
@@ -86,8 +85,8 @@ class OffPolicy(Resumable, Algorithm):
                 actions must have bounds), or the dataset.
             FileNotFoundError: If there is no such dataset.
         """
-        limits, device = constrained_limits(config, env), torch.device(config.device)
-        constraints = Constraints.from_config(config, env, limits)
+        device, constraints = torch.device(config.device), Constraints.from_config(config, env)
+        limits = constraints.cost_limits
         multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
         if multiplier is not None:
             multiplier.to(device)
@@ -299,41 +298,37 @@ def build_networks(
             "model=mlp, model=cnn or model=dict without it."
         )
     common: dict[str, Any] = {"hidden_sizes": list(model.hidden_sizes), "device": device}
-    inputs = _inputs(critic_entries(None, env.observation_spec), config, env)
+    entries = observed_entries(env.observation_spec)
+    layouts = {"observation": env.observation_layout, "privileged": env.privileged_layout}
+    encoders = model.get("encoders")
+    seen = Observed(entries, layouts, model.input_scale, clip=None, encoders=encoders)
+    check_encoders(seen)
     bounds = {"low": spec.low, "high": spec.high}
-    networks = {"actor": instantiate(config.actor, **inputs(device), **bounds, **common)}
+    networks = {"actor": instantiate(config.actor, **_inputs(seen, device), **bounds, **common)}
     common["action_size"] = len(spec.low)
-    inputs = _inputs(critic_entries(critic_observes, env.observation_spec), config, env)
+    if critic_observes:
+        seen = seen._replace(entries=critic_entries(critic_observes, env.observation_spec))
     if number := config.critics.rewards:
-        networks["critic"] = QEnsemble(num_networks=number, **inputs(device, "action"), **common)
+        inputs = _inputs(seen, device, "action")
+        networks["critic"] = QEnsemble(num_networks=number, **inputs, **common)
     if num_costs and (number := config.critics.costs):
         networks["cost_critic"] = QEnsemble(
             num_networks=number * cost_values.networks,
             num_outputs=outputs,
             out_key="cost_state_action_value",
-            **inputs(device, "action"),
+            **_inputs(seen, device, "action"),
             **common,
         )
     return networks
 
 
-def _inputs(
-    entries: Sequence[Entry], config: DictConfig, env: EnvBase
-) -> Callable[..., dict[str, Any]]:
-    """A function that returns arguments of a constructor for entries, with a new encoder."""
-    layouts = {"observation": env.observation_layout, "privileged": env.privileged_layout}
-    scale, encoders = config.model.input_scale, config.model.get("encoders")
-    observed = Observed(entries, layouts, scale, clip=None, encoders=encoders)
-    check_encoders(observed._replace(entries=observed_entries(env.observation_spec)))
-
-    def arguments(device: torch.device, *further: str) -> dict[str, Any]:
-        # an actor of the user's need not take keys that vectors do not need
-        needs_keys = further or encoders or observed.keys != ["observation"]
-        keys = {"in_keys": [*observed.keys, *further]} if needs_keys else {}
-        if encoders is None:
-            size = sum(entry.shape[0] for entry in entries)
-            return {"observation_size": size, "input_scale": observed.scales(), **keys}
-        codes = Codes(observed, device)
-        return {"observation_size": codes.size, "encoder": codes, **keys}
-
-    return arguments
+def _inputs(observed: Observed, device: torch.device, *further: str) -> dict[str, Any]:
+    """Arguments of a network for observed entries, and keys of further ones, with a new encoder."""
+    # an actor of the user's need not take keys that vectors do not need
+    needs_keys = further or observed.encoders or observed.keys != ["observation"]
+    keys = {"in_keys": [*observed.keys, *further]} if needs_keys else {}
+    if observed.encoders is None:
+        size = sum(entry.shape[0] for entry in observed.entries)
+        return {"observation_size": size, "input_scale": observed.scales(), **keys}
+    codes = Codes(observed, device)
+    return {"observation_size": codes.size, "encoder": codes, **keys}

@@ -20,14 +20,15 @@ from safe_rl.algorithms.algorithm_contract import (
     Stateful,
     networks_of_target,
 )
-from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints, constrained_limits
+from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
-from safe_rl.objectives import CriticLoss, JointAdvantages, LimitState, Multiplier
+from safe_rl.objectives import CriticLoss, LimitState, Multiplier
 from safe_rl.objectives.advantages import CostGAE, VectorGAE
 from safe_rl.objectives.critics import critic_bias
+from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.trust import instantiate
 
 
@@ -77,34 +78,37 @@ class OnPolicy(Algorithm):
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.
         """
-        limits, device = constrained_limits(config, env), torch.device(config.device)
-        constraints = Constraints.from_config(config, env, limits)
-        multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
+        device, constraints = torch.device(config.device), Constraints.from_config(config, env)
+        multiplier = instantiate(config.get("lagrangian"), cost_limits=constraints.cost_limits)
         if multiplier is not None:
             multiplier.to(device)
-        networks = _build_networks(config, env, len(limits), device, config.model)
+        num_costs = len(constraints.keys)
+        networks = _build_networks(config, env, num_costs, device, config.model)
         critic, cost_critic = networks["critic"], networks.get("cost_critic")
+        optional = {  # what a part may take as well, also one of the user's
+            "critic_network": critic,
+            "multiplier": multiplier,
+            "cost_keys": constraints.keys,
+            "cost_limits": constraints.measured_limits,
+        }
         cost_advantage = None
-        if limits:
-            if config.get("cost_advantage") is None:
+        if num_costs:
+            node = config.get("cost_advantage")
+            if node is None:
                 raise ValueError(
                     f"algo={config.algo.name} is constrained and has no cost_advantage."
                 )
-            cost_advantage = instantiate(
-                config.cost_advantage,
-                {"cost_limits": constraints.measured_limits},
-                value_network=cost_critic,
-                cost_keys=constraints.keys,
-            )
+            cost_advantage = instantiate(node, optional, value_network=cost_critic)
             if constraints.risk is not None:
                 cost_advantage.set_keys(reward=[PENALISED_COSTS])
+        loss = instantiate(config.loss, optional, actor_network=networks["actor"])
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
             multiplier=multiplier,
             advantage=instantiate(config.advantage, value_network=critic),
             cost_advantage=cost_advantage,
-            policy_update=_policy_update(config, networks, constraints, multiplier),
+            policy_update=instantiate(config.policy_update, optional, loss=loss),
             critic_update=instantiate(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 
@@ -132,7 +136,12 @@ class OnPolicy(Algorithm):
         limits = constraints.update(batch, episodes)
         if multiplier is not None:
             multiplier.update(limits)
-        JointAdvantages(self.advantage, self.cost_advantage)(batch)
+        self.advantage(batch)
+        keys = {"advantage": self.advantage.tensor_keys.advantage}
+        if self.cost_advantage is not None:
+            self.cost_advantage(batch)
+            keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
+        normalise_advantages(batch, **keys)
         bias = self._critic_bias(batch)
         metrics = self._update(batch, limits)
         constraints.record_prediction(limits, metrics["policy"])
@@ -158,47 +167,29 @@ class OnPolicy(Algorithm):
         """Improve the policy and fit the critics, in parallel where they are independent."""
         improve = partial(self.policy_update, batch, limits)
         fit = partial(self.critic_update, batch)
-        both = (improve(), fit()) if self._shares_critics() else in_parallel(improve, fit)
-        return {"policy": both[0], "critic": both[1]}
-
-    def _shares_critics(self) -> bool:
-        """Whether the policy's update changes a critic: then the updates cannot run in parallel."""
         fitting = self.critic_update.loss_modules().values()
         fitted = {p.data_ptr() for module in fitting for p in module.parameters()}
         moved = [self.actor, *self.policy_update.loss_modules().values()]
-        return any(p.data_ptr() in fitted for module in moved for p in module.parameters())
+        # a policy loss may also train a critic
+        shares = any(p.data_ptr() in fitted for module in moved for p in module.parameters())
+        both = (improve(), fit()) if shares else in_parallel(improve, fit)
+        return {"policy": both[0], "critic": both[1]}
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a state, by name."""
         multiplier = self.multiplier
         kept = [*self.networks.values(), *([] if multiplier is None else [multiplier])]
+        losses = LossState(self.policy_update.loss_modules(), saved_elsewhere=kept)
         parts: dict[str, Stateful | None] = {
             **self.networks,
             "multiplier": multiplier,
-            # None if the losses have no state of their own, such as those of this package
-            "losses": LossState(self.policy_update.loss_modules(), saved_elsewhere=kept) or None,
+            # those of this package have no state of their own
+            "losses": losses if losses.tensors else None,
             "policy_update": self.policy_update,
             "critic_update": self.critic_update,
             "algorithm": self.constraints,
         }
         return {name: part for name, part in parts.items() if part is not None}
-
-
-def _policy_update(
-    config: DictConfig,
-    networks: Mapping[str, Any],
-    constraints: Constraints,
-    multiplier: Multiplier | None,
-) -> PolicyUpdate:
-    """The update of the policy: ``policy_update`` on ``loss``."""
-    optional = {  # what a loss or an update of a user may take as well
-        "critic_network": networks["critic"],
-        "multiplier": multiplier,
-        "cost_keys": constraints.keys,
-        "cost_limits": constraints.measured_limits,
-    }
-    loss = instantiate(config.loss, optional, actor_network=networks["actor"])
-    return instantiate(config.policy_update, optional, loss=loss)
 
 
 def _build_networks(

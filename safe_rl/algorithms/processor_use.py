@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from safe_rl.models.networks import cpuinfo
 
 
+@cache
 def prefers_onednn(cpuinfo: str) -> bool:
     """Whether oneDNN multiplies matrices faster than MKL on a processor, and as exactly.
 
@@ -30,11 +31,6 @@ def prefers_onednn(cpuinfo: str) -> bool:
     words = set(cpuinfo.split())
     has_tiles = any(word.startswith("amx") for word in words)
     return {"AuthenticAMD", "avx512f"} <= words and not has_tiles
-
-
-@cache
-def _is_of_use() -> bool:
-    return torch.backends.mkldnn.is_available() and prefers_onednn(cpuinfo())
 
 
 @contextmanager
@@ -54,7 +50,8 @@ def fast_products() -> Iterator[None]:
     """
     products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # made at run time
     before = products.fp32_precision
-    if before != "none" or not _is_of_use():
+    is_available = torch.backends.mkldnn.is_available()
+    if before != "none" or not (is_available and prefers_onednn(cpuinfo())):
         yield
         return
     products.fp32_precision = "bf16"

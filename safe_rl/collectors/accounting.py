@@ -135,11 +135,6 @@ class EpisodeStatistics:
         return rows
 
 
-def _is_observed(key: NestedKey) -> bool:
-    names = (key,) if isinstance(key, str) else key
-    return names[names[0] == "next"] == "observation"
-
-
 class EpisodeAccounting(Resumable):
     """Sum rewards and costs over episodes that may span any number of batches.
 
@@ -225,10 +220,10 @@ class EpisodeAccounting(Resumable):
                 f"environments: it needs [{num_envs}, T], as the collector returns it."
             )
         columns = {key: self._column(batch, key) for key in self._signal_keys}
-        seen = {key: batch[key] for key in batch.keys(True, True) if _is_observed(key)}
+        observed = batch.select("observation", ("next", "observation"), strict=False)
         # actions last: a policy that observes NaN acts with NaN
         acted = {} if (action := batch.get("action", None)) is None else {"action": action}
-        check_steps({**seen, **columns, **acted}, self.cost_keys)
+        check_steps({**dict(observed.items(True, True)), **columns, **acted}, self.cost_keys)
         signals = torch.stack(list(columns.values()), -1)
         steps, num_steps = torch.ones_like(signals[..., 0]), batch.numel()
         if self.steps_per_decision != 1:
@@ -238,7 +233,12 @@ class EpisodeAccounting(Resumable):
         before = self.open_sums[:, 2:]
         finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
         finished = finished[finished[:, 0].isfinite()]
-        self._require_ends(finished[:, 0])
+        longest = torch.cat([finished[:, 0], self.open_sums[:, 0]]).nan_to_num().max().item()
+        if self.longest is not None and longest > self.longest:
+            raise EpisodeError(
+                f"An episode has {longest:g} steps, but the environment's 'max_episode_steps' is "
+                f"{self.longest}: it has to end episodes itself ('done' and 'truncated')."
+            )
         self.totals += signals.sum((0, 1))
         names = [key_name(key) for key in self.cost_keys]
         reward_rate, *rates = self.totals[1:] / self.totals[0]
@@ -266,17 +266,6 @@ class EpisodeAccounting(Resumable):
         last = num_done.view(-1, 1, 1).expand(-1, 1, num_sums)
         self.open_sums = sums.gather(1, last).squeeze(1)
         return sums[is_finished]
-
-    def _require_ends(self, lengths: Tensor) -> None:
-        """Refuse episodes, finished with lengths [E] or unfinished, longer than `longest`."""
-        if self.longest is None:
-            return
-        steps = torch.cat([lengths, self.open_sums[:, 0]]).nan_to_num().max().item()
-        if steps > self.longest:
-            raise EpisodeError(
-                f"An episode has {steps:g} steps, but the environment's 'max_episode_steps' is "
-                f"{self.longest}: it has to end episodes itself ('done' and 'truncated')."
-            )
 
     @staticmethod
     def _column(batch: TensorDictBase, key: NestedKey) -> Tensor:

@@ -59,7 +59,8 @@ def build_networks(
     encoders = model.get("encoders")
     layouts = {"observation": layout, "privileged": privileged_layout or {}}
     observed = Observed(entries, layouts, model["input_scale"], clip=normalise, encoders=encoders)
-    read = critic_entries(model.get("critic_observes"), observation_spec)
+    chosen = model.get("critic_observes")
+    read = critic_entries(chosen, observation_spec) if chosen else entries
     check_encoders(observed)
     widths = list(model["hidden_sizes"])
     recurrent_size = model["memory"]["size"] if model.get("memory") else 0

@@ -53,19 +53,18 @@ def observed_entries(observation_spec: Composite) -> list[Entry]:
     return [_entry(("observation", name), name, observed[name]) for name in names]
 
 
-def critic_entries(chosen: Sequence[str] | None, observation_spec: Composite) -> list[Entry]:
-    """Return the entries that critics read.
+def critic_entries(chosen: Sequence[str], observation_spec: Composite) -> list[Entry]:
+    """Return the entries that critics read, if a configuration chooses them.
 
     Args:
-        chosen: ``model.critic_observes``, of ``observation`` and ``privileged``; None: the
-            observation.
+        chosen: ``model.critic_observes``, of ``observation`` and ``privileged``.
         observation_spec: Spec of the observations of N environments.
 
     Raises:
         ValueError: If the environment does not write an entry.
     """
     entries: list[Entry] = []
-    for name in chosen or ["observation"]:
+    for name in chosen:
         if name == "observation":
             entries += observed_entries(observation_spec)
         elif name in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
@@ -112,11 +111,6 @@ class Observed(NamedTuple):
         """Keys of the entries."""
         return [entry.key for entry in self.entries]
 
-    @property
-    def is_vector(self) -> bool:
-        """Whether there is one entry, a vector."""
-        return len(self.entries) == 1 and len(self.entries[0].shape) == 1
-
     def scale(self, entry: Entry) -> Tensor | None:
         """Factors [n] of the columns of a vector; None if all are 1."""
         # an entry of a dictionary may have the name "observation", too
@@ -141,30 +135,19 @@ def check_encoders(observed: Observed) -> None:
         ValueError: With the ``model`` to choose.
     """
     encoders, entries = observed.encoders, observed.entries
-    if encoders is not None and not encoders["vector"] and observed.is_vector:
+    is_vector = len(entries) == 1 and len(entries[0].shape) == 1
+    if encoders is not None and not encoders["vector"] and is_vector:
         raise ValueError(
             "model=cnn encodes pictures, and this environment observes only a vector. Use "
             "model=mlp, or an environment with pictures, such as env=PointGoal1Vision."
         )
-    if encoders is None and not observed.is_vector:
+    if encoders is None and not is_vector:
         pictures = any(len(entry.shape) == 3 for entry in entries)
         advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(
             f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
             f"vector: use {advice}, or {TO_FLATTEN}."
         )
-
-
-def make_encoders(
-    observed: Observed, device: torch.device | None
-) -> tuple[list[nn.Module], list[int]]:
-    """An encoder for every entry, and the sizes of their outputs."""
-    encoders, sizes = [], []
-    for entry in observed.entries:
-        encoder = (_vector if len(entry.shape) == 1 else _picture)(entry, observed, device)
-        encoders.append(encoder)
-        sizes.append(encoder(_blank(entry, device)).shape[-1])
-    return encoders, sizes
 
 
 class Codes(nn.Module):
@@ -180,15 +163,18 @@ class Codes(nn.Module):
 
     def __init__(self, observed: Observed, device: torch.device | None = None) -> None:
         super().__init__()
-        encoders, sizes = make_encoders(observed, device)
-        self.encoders, self.size = nn.ModuleList(encoders), sum(sizes)
+        self.encoders, self.size = nn.ModuleList(), 0
+        for entry in observed.entries:
+            encoder = (_vector if len(entry.shape) == 1 else _picture)(entry, observed, device)
+            self.encoders.append(encoder)
+            self.size += encoder(_blank(entry, device)).shape[-1]
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Entries [..., n] or [..., height, width, colours] -> [..., size]."""
         return torch.cat([encode(x) for encode, x in zip(self.encoders, inputs, strict=True)], -1)
 
 
-class Body(nn.Module):
+class Body(Codes):
     """Encode every entry, concatenate the codes, and run a perceptron on them.
 
     Args:
@@ -208,16 +194,14 @@ class Body(nn.Module):
         extra: int = 0,
         device: torch.device | None = None,
     ) -> None:
-        super().__init__()
-        assert observed.encoders is not None
-        encoders, sizes = make_encoders(observed, device)
-        self.encoders = nn.ModuleList(encoders)
-        self.perceptron = perceptron(sum(sizes) + extra, out_features, hidden_sizes, None, device)
+        super().__init__(observed, device)
+        self.perceptron = perceptron(self.size + extra, out_features, hidden_sizes, None, device)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Entries [..., n] or [..., height, width, colours] -> [..., out_features]."""
-        codes = [encode(x) for encode, x in zip(self.encoders, inputs, strict=False)]
-        return self.perceptron(torch.cat([*codes, *inputs[len(codes) :]], -1))
+        number = len(self.encoders)
+        codes = super().forward(*inputs[:number])
+        return self.perceptron(torch.cat([codes, *inputs[number:]], -1))
 
 
 class Pixels(nn.Module):

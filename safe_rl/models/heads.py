@@ -1,6 +1,6 @@
 """Heads of policies: from the outputs of a network to a distribution of actions.
 
-Every row of `HEADS` says for which actions its head is meant; `auto` takes the first that fits.
+`fitting_heads` says which heads are meant for which actions; `auto` takes the first of them.
 """
 
 from __future__ import annotations
@@ -54,13 +54,6 @@ class Head(NamedTuple):
     distribution: Callable[..., distributions.Distribution]
 
 
-class _Row(NamedTuple):
-    """A head: the actions that it is meant for, and the function that makes it."""
-
-    fits: Callable[[TensorSpec], bool]
-    make: Callable[[TensorSpec, float, torch.device | None], Head]
-
-
 def make_head(
     kind: str,
     action_spec: TensorSpec,
@@ -86,7 +79,7 @@ def make_head(
         >>> make_head("auto", Categorical(4, shape=(8,)), initial_log_std=-0.5).num_outputs
         4
     """
-    fitting = [name for name, row in HEADS.items() if row.fits(action_spec)]
+    fitting = fitting_heads(action_spec)
     if not fitting:
         raise ValueError(
             f"No policy can act in {type(action_spec).__name__}{list(action_spec.shape)}: actions "
@@ -98,7 +91,20 @@ def make_head(
             f"model.head={kind} is not for the actions of this environment: "
             f"{' or '.join((AUTO, *fitting))}."
         )
-    return HEADS[chosen].make(action_spec, initial_log_std, device)
+    return HEADS[chosen](action_spec, initial_log_std, device)
+
+
+def fitting_heads(spec: TensorSpec) -> tuple[str, ...]:
+    """Return the heads for the actions of N environments, the usual one first."""
+    is_matrix, is_real = len(spec.shape) == 2, spec.dtype.is_floating_point
+    if isinstance(spec, Bounded) and is_real:
+        return ("gaussian", "tanh", "beta") if is_matrix else ()
+    if isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot):
+        return ("one_hot",) if is_matrix else ()
+    is_choice = isinstance(spec, Categorical) and not isinstance(spec, Binary)
+    if isinstance(spec, Bounded):  # Gymnasium's MultiDiscrete of several environments
+        is_choice = not spec.space.low.any()
+    return ("categorical",) if is_choice and len(spec.shape) <= 2 else ()
 
 
 def action_sampler(
@@ -249,31 +255,10 @@ def _num_choices(spec: TensorSpec) -> list[int]:
     return [highest + 1 for highest in spec.space.high.reshape(-1, size)[0].tolist()]
 
 
-def _is_continuous(spec: TensorSpec) -> bool:
-    return isinstance(spec, Bounded) and spec.dtype.is_floating_point and len(spec.shape) == 2
-
-
-def _is_choice(spec: TensorSpec) -> bool:
-    if len(spec.shape) > 2:
-        return False
-    if isinstance(spec, Bounded) and not spec.dtype.is_floating_point:
-        return not spec.space.low.any()  # Gymnasium's MultiDiscrete of several environments
-    return isinstance(spec, Categorical) and not isinstance(spec, Binary)
-
-
-def _is_one_hot(spec: TensorSpec) -> bool:
-    return isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot) and len(spec.shape) == 2
-
-
-HEADS: Mapping[str, _Row] = {
-    "gaussian": _Row(
-        _is_continuous, lambda spec, log_std, device: gaussian_head(spec.shape[-1], log_std, device)
-    ),
-    "tanh": _Row(_is_continuous, _tanh),
-    "beta": _Row(_is_continuous, _beta),
-    "categorical": _Row(_is_choice, _categorical),
-    "one_hot": _Row(
-        _is_one_hot,
-        lambda spec, *_: Head(spec.shape[-1], nn.Identity(), ("logits",), OneHotCategorical),
-    ),
+HEADS: Mapping[str, Callable[[TensorSpec, float, torch.device | None], Head]] = {
+    "gaussian": lambda spec, log_std, device: gaussian_head(spec.shape[-1], log_std, device),
+    "tanh": _tanh,
+    "beta": _beta,
+    "categorical": _categorical,
+    "one_hot": lambda spec, *_: Head(spec.shape[-1], nn.Identity(), ("logits",), OneHotCategorical),
 }

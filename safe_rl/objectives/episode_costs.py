@@ -150,6 +150,9 @@ class EpisodeCosts(Resumable):
         smallest: Costs per step, of size `unit`. The drift is relative to J_c, or to the J_c of
             this many costs if it is larger. Otherwise an estimate of 0 could never change again.
 
+    Attributes:
+        lengths: Mean episode length T̄.
+
     Examples:
         >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
         >>> costs = torch.zeros(4, 200, 1)
@@ -178,11 +181,6 @@ class EpisodeCosts(Resumable):
         self._scatter = torch.zeros(2, num_costs, dtype=torch.float32)
 
     @property
-    def length(self) -> Tensor:
-        """Mean episode length T̄ in steps, scalar."""
-        return self.lengths.mean
-
-    @property
     def unit(self) -> Tensor:
         """Typical size of one cost, Σ c² / Σ c over all steps, [k]; 1 for costs of 0 or 1."""
         first, second = self._sums
@@ -207,7 +205,7 @@ class EpisodeCosts(Resumable):
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
         limited = costs if penalised is None else penalised.costs.to(costs)
-        batch = CostEstimate(*(each.float() for each in rate_estimate(limited, self.length)))
+        batch = CostEstimate(*(each.float() for each in rate_estimate(limited, self.lengths.mean)))
         if penalised is not None:
             batch = batch._replace(mean=batch.mean + penalised.offset)
         self.batch = batch
@@ -220,7 +218,7 @@ class EpisodeCosts(Resumable):
 
     def _size(self, mean: Tensor) -> Tensor:
         """J_c, or its lower bound `smallest`, [k]."""
-        return torch.maximum(mean, self.smallest * self.length * self.unit)
+        return torch.maximum(mean, self.smallest * self.lengths.mean * self.unit)
 
     def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
         """Standard error of a batch, expected from earlier batches, for J_c of this size, [k].

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -86,28 +84,6 @@ def gae(
     return vec_generalized_advantage_estimate(gamma, lmbda, value, next_value, reward, *flags)[0]
 
 
-def standardise(advantage: Tensor) -> Tensor:
-    """Shift and scale to mean 0 and (population) standard deviation 1."""
-    centred = advantage - advantage.mean()
-    return centred / centred.square().mean().sqrt().clamp_min(1e-8)
-
-
-def centre(advantage: Tensor) -> Tensor:
-    """Shift each of k signals [..., k] to mean 0 over the batch."""
-    return advantage - advantage.flatten(0, -2).mean(0)
-
-
-def _of_samples(
-    change: Callable[[Tensor], Tensor], advantage: Tensor, mask: Tensor | None
-) -> Tensor:
-    """Apply a function to the samples alone; padding becomes 0."""
-    if mask is None:
-        return change(advantage)
-    changed = torch.zeros_like(advantage)
-    changed[mask] = change(advantage[mask])
-    return changed
-
-
 def normalise_advantages(
     tensordict: TensorDictBase,
     *,
@@ -141,8 +117,13 @@ def normalise_advantages(
         tensor([-2.,  2.])
     """
     mask = sample_mask(tensordict)
-    tensordict.set(advantage, _of_samples(standardise, require(tensordict, advantage), mask))
-    costs = tensordict.get(cost_advantage, None)
+    samples = ... if mask is None else mask
+    reward, costs = require(tensordict, advantage), tensordict.get(cost_advantage, None)
+    centred, scaled = reward[samples] - reward[samples].mean(), torch.zeros_like(reward)
+    scaled[samples] = centred / centred.square().mean().sqrt().clamp_min(1e-8)
+    tensordict.set(advantage, scaled)
     if costs is not None:
-        tensordict.set(cost_advantage, _of_samples(centre, costs, mask))
+        shifted = torch.zeros_like(costs)
+        shifted[samples] = costs[samples] - costs[samples].flatten(0, -2).mean(0)
+        tensordict.set(cost_advantage, shifted)
     return tensordict

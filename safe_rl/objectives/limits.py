@@ -299,7 +299,7 @@ class LimitTracker(Checked, Resumable):
         if penalised is not None:
             self.limits = penalised.limit
         batch = self.costs.batch
-        smallest = self.smallest_scale * self.costs.length * self.costs.unit
+        smallest = self.smallest_scale * self.costs.lengths.mean * self.costs.unit
         scale = torch.maximum(self.limits, smallest)
         self.predictions.update(batch.mean, prior=0.5 * scale)
         noise = torch.lerp(batch.error, self._noise, self.decay)
@@ -312,7 +312,7 @@ class LimitTracker(Checked, Resumable):
         return LimitState(
             cost=estimate.mean,
             target=target,
-            length=self.costs.length,
+            length=self.costs.lengths.mean,
             unit=self.costs.unit,
             scale=scale,
             realised_share=self.predictions.share,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase, is_tensor_collection
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
@@ -99,7 +99,8 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
         FloatingPointError: If there are any; the message names the entry and how many samples.
     """
     mask = sample_mask(tensordict)
-    for key, entry in _tensors(tensordict, keys):
+    # of nested TensorDicts all tensors
+    for key, entry in tensordict.select(*keys, strict=False).items(True, True):
         if not entry.is_floating_point() or entry.is_meta:
             continue
         # A finite sum has only finite terms, and is much faster than a check of each term.
@@ -113,18 +114,6 @@ def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> Non
                 "has been learned from this batch: look for the environment's first NaN or "
                 "infinity, or lower the learning rate or the target KL if training has diverged."
             )
-
-
-def _tensors(
-    tensordict: TensorDictBase, keys: Iterable[NestedKey]
-) -> Iterator[tuple[NestedKey, Tensor]]:
-    """Pairs of key and tensor; for the key of a nested TensorDict, all tensors in it."""
-    for key in keys:
-        entry = tensordict.get(key, None)
-        if is_tensor_collection(entry):
-            yield from ((unravel_key((key, name)), x) for name, x in entry.items(True, True))
-        elif entry is not None:
-            yield key, entry
 
 
 class SharesTensors(LossModule):

@@ -174,10 +174,6 @@ def backtracking_search(
 Geometry = tuple[list[Tensor], Callable[[Sequence[Tensor]], list[Tensor]]]
 
 
-def _num_states(distribution: Distribution) -> int:
-    return max(1, distribution.batch_shape.numel())
-
-
 def _normal_geometry(normal: Normal, num_states: int) -> Geometry:
     """Fisher matrix of a Gaussian: 1/σ² for its mean and 2/σ² for its standard deviation σ."""
     precision = normal.scale.detach().square().reciprocal() / num_states
@@ -238,11 +234,11 @@ def _geometry_by_differentiation(
 def policy_geometry(actor: ProbabilisticTensorDictSequential, batch: TensorDictBase) -> Geometry:
     """Outputs of a policy's network in the states of a batch, and their mean Fisher matrix."""
     distribution = policy_in(actor, batch)
-    base = root(distribution)
+    base, num_states = root(distribution), max(1, distribution.batch_shape.numel())
     if isinstance(base, Normal):
-        return _normal_geometry(base, _num_states(distribution))
+        return _normal_geometry(base, num_states)
     if isinstance(base, Categorical):
-        return _categorical_geometry(base, _num_states(distribution))
+        return _categorical_geometry(base, num_states)
     return _geometry_by_differentiation(actor, batch)
 
 

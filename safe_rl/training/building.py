@@ -73,8 +73,10 @@ def build_trainer(
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
     writer = RunWriter(Run(directory), config, cost_limits, env.max_episode_steps)
-    known = {"interface": env.interface, "is_privileged": bool(env.privileged_layout)}
-    recording = Recording(writer.run.transitions_folder, env.cost_keys, **known)
+    recording = None
+    if config.get("record"):
+        known = {"interface": env.interface, "is_privileged": bool(env.privileged_layout)}
+        recording = Recording(writer.run.transitions_folder, env.cost_keys, **known)
     return Trainer(
         env=env,
         algorithm=algorithm,
@@ -83,7 +85,7 @@ def build_trainer(
         writer=writer,
         config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
-        recording=recording if config.get("record") else None,
+        recording=recording,
     )
 
 

@@ -6,13 +6,14 @@ from point_mass_runs import point_mass_trainer
 
 from safe_rl.algorithms import processor_use
 from safe_rl.algorithms.processor_use import fast_products, prefers_onednn
+from safe_rl.models.networks import cpuinfo
 
 ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
 
 
 @pytest.fixture
 def of_use(monkeypatch):
-    monkeypatch.setattr(processor_use, "_is_of_use", lambda: True)
+    monkeypatch.setattr(processor_use, "prefers_onednn", lambda cpuinfo: True)
     products = torch.backends.mkldnn.matmul
     before = products.fp32_precision
     yield products
@@ -20,7 +21,7 @@ def of_use(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cpuinfo", "expected"),
+    ("text", "expected"),
     [
         (ZEN, True),
         (ZEN.replace("AuthenticAMD", "GenuineIntel"), False),
@@ -30,11 +31,11 @@ def of_use(monkeypatch):
         ("", False),
     ],
 )
-def test_only_where_it_is_faster_and_rounds_nothing(cpuinfo, expected):
-    assert prefers_onednn(cpuinfo) is expected
+def test_only_where_it_is_faster_and_rounds_nothing(text, expected):
+    assert prefers_onednn(text) is expected
 
 
-@pytest.mark.skipif(not processor_use._is_of_use(), reason="a processor that MKL serves well")
+@pytest.mark.skipif(not prefers_onednn(cpuinfo()), reason="a processor that MKL serves well")
 @pytest.mark.parametrize("shape", [(4000, 60, 64), (4000, 64, 1), (256, 128, 128)])
 def test_products_are_those_of_single_precision(shape):
     rows, inner, columns = shape

@@ -96,11 +96,19 @@ def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_pat
     assert row["critic_num_steps"] == 12
 
 
-def test_an_actor_that_shares_layers_with_the_critic_is_moved_before_its_fit(tmp_path):
+def test_an_actor_that_shares_layers_with_the_critic_is_moved_before_its_fit(tmp_path, monkeypatch):
     """Also by a step on a plain function, which has no parameters of its own."""
-    algorithm = point_mass_trainer(tmp_path, "algo=trpo", minibatch_size=None).algorithm
+    calls = []
+    monkeypatch.setattr(
+        on_policy, "in_parallel", lambda *both: calls.append(both) or [call() for call in both]
+    )
+    trainer = point_mass_trainer(tmp_path, "algo=trpo", minibatch_size=None)
+    algorithm = trainer.algorithm
     loss = algorithm.policy_update.loss
     algorithm.policy_update.loss = lambda batch: loss(batch)
-    assert not algorithm._shares_critics()
+    batches = trainer.batches()
+    trainer.epoch(batches)
+    assert len(calls) == 1
     algorithm.actor.add_module("trunk", algorithm.critic.module)
-    assert algorithm._shares_critics()
+    trainer.epoch(batches)
+    assert len(calls) == 1

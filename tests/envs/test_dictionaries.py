@@ -23,13 +23,13 @@ def test_values_of_numpy_are_those_of_python():
         **{"placements_extents": np.array([-3, -3, 3, 3]), "sensors_obs": np.array(["gyro"])},
     }
     plain = {key: value.tolist() for key, value in given.items()}
-    config = SafetyGymConfig.from_dict(given)
-    assert config == SafetyGymConfig.from_dict(plain)
+    config = SafetyGymConfig(**given)
+    assert config == SafetyGymConfig(**plain)
     assert {type(config.hazards_num), type(config.num_steps)} == {int}
     assert config.constrain_hazards is True
     for wrong in ({"hazards_num": np.True_}, {"lidar_alias": np.int8(1)}):
         with pytest.raises(ConfigError):
-            SafetyGymConfig.from_dict(wrong)
+            SafetyGymConfig(**wrong)
 
 
 @pytest.mark.parametrize("clip", [0, None, 0.5])

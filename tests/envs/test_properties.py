@@ -156,7 +156,7 @@ def test_wrong_values_name_their_key(data):
     key = data.draw(st.sampled_from(sorted(FIELDS)))
     value = data.draw(WRONG.get(FIELDS[key], NOT_NUMBERS))
     with pytest.raises(ConfigError, match=f"{key}="):
-        SafetyGymConfig.from_dict({key: value})
+        SafetyGymConfig(**{key: value})
 
 
 @often

@@ -40,7 +40,7 @@ def test_a_batch_of_whole_episodes_gives_their_mean_cost_whatever_their_lengths(
     lengths = torch.tensor([4.0, 8.0, 12.0, 6.0, 6.0])
     estimate = estimator.update(costs, lengths)
     torch.testing.assert_close(estimate.mean, costs.sum((0, 1)) / 5)
-    assert estimator.length == pytest.approx(7.2)
+    assert estimator.lengths.mean == pytest.approx(7.2)
 
 
 def steps_of_a_policy(mean_lengths: list[float], rows: int, steps: int, longest: int = 1000):
@@ -67,7 +67,7 @@ def test_the_length_follows_episodes_that_grow_longer_and_shorter_again():
     found = []
     for ended in steps_of_a_policy(falls, rows, steps):
         estimator.update(torch.full((rows, steps, 1), 0.05), ended)
-        found.append(estimator.length)
+        found.append(estimator.lengths.mean)
     error = (torch.stack(found) / truth).log()
     growth, shrinkage = error[:41], error[-41:]
     assert error.abs().mean() < 0.1
@@ -84,7 +84,7 @@ def test_where_all_episodes_have_one_length_it_is_exact(rows, steps):
         ages = starts + batch * steps
         number = int(((ages + steps) // 1000 - ages // 1000).sum())
         estimator.update(torch.zeros(rows, steps, 1), torch.full((number,), 1000.0))
-        assert estimator.length == 1000
+        assert estimator.lengths.mean == 1000
 
 
 @pytest.mark.parametrize("rows", [1, 2, 50])

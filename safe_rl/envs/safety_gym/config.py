@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
@@ -66,7 +67,7 @@ class SafetyGymConfig(Keys):
         raise AttributeError(f"There is no configuration key '{name}'.{did_you_mean(name, KEYS)}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return SafetyGymConfig.from_dict, (self.to_dict(),)
+        return partial(SafetyGymConfig, **self.to_dict()), ()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SafetyGymConfig) and self.to_dict() == other.to_dict()
@@ -78,17 +79,12 @@ class SafetyGymConfig(Keys):
         values = (f"{k}={v!r}" for k, v in self.to_dict().items() if v != KEYS[k].default)
         return f"SafetyGymConfig({', '.join(values)})"
 
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> SafetyGymConfig:
-        """Build a configuration from a flat mapping."""
-        return cls(**{str(key): value for key, value in values.items()})
-
     def replace(self, **changes: Any) -> SafetyGymConfig:
         """Return a copy with some keys changed, checked like a new one."""
-        return self.from_dict({**self.to_dict(), **changes})
+        return SafetyGymConfig(**{**self.to_dict(), **changes})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a flat mapping of all keys, which `from_dict` accepts."""
+        """Return a flat mapping of all keys, which the constructor accepts."""
         return {name: getattr(self, name) for name in KEYS}
 
 

@@ -151,7 +151,7 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     if isinstance(env, SafetyGymConfig):
         return check(env)
     if isinstance(env, Mapping):
-        return check(SafetyGymConfig.from_dict(env))
+        return check(SafetyGymConfig(**env))
     if not isinstance(env, str):
         raise ConfigError(
             "An environment is given by its name, a mapping of keys, or a SafetyGymConfig; got a "

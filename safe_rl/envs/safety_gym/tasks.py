@@ -34,13 +34,6 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
     return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + (r - radius).abs())
 
 
-def distance(a: Tensor, b: Tensor) -> Tensor:
-    """Euclidean distance over the last dimension."""
-    import torch
-
-    return torch.linalg.vector_norm(a - b, dim=-1)
-
-
 class NextGoal(Enum):
     """How a new goal is drawn."""
 
@@ -72,7 +65,9 @@ class Task(NamedTuple):
 
 def goal_distance(world: World) -> Tensor:
     """Distance [N, 1] of the robot from the goal on the floor [m]."""
-    return distance(world.robot_xy.unsqueeze(1), world.at("goal")[..., :2])
+    import torch
+
+    return torch.linalg.vector_norm(world.robot_xy.unsqueeze(1) - world.at("goal")[..., :2], dim=-1)
 
 
 def _approach(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
@@ -92,9 +87,8 @@ def _to_box_and_goal(world: World) -> Tensor:
     import torch
 
     box = world.at("box")
-    return torch.cat(
-        [distance(world.robot_pos[:, None], box), distance(box, world.at("goal"))], dim=-1
-    )
+    apart = torch.cat([world.robot_pos[:, None] - box, box - world.at("goal")], 1)
+    return torch.linalg.vector_norm(apart, dim=-1)
 
 
 def _push(config: SafetyGymConfig, world: World, before: Tensor, now: Tensor) -> Tensor:
