@@ -118,6 +118,7 @@ class OffPolicy(Resumable, Algorithm):
             reward_keys=["reward", *constraints.keys],
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
+            example=env.fake_tensordict(),
             **others,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)

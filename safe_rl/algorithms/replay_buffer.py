@@ -16,6 +16,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.checks import Checked, Share
+from safe_rl.naming import key_name
 from safe_rl.resumable import Resumable
 
 _MOST_AT_ONCE = 16_384
@@ -46,6 +47,8 @@ class Memory(Checked):
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
+        example: A step [N] with the entries of all steps, such as ``env.fake_tensordict()``:
+            transitions of other shapes and types are not restored. None: all are.
 
     Raises:
         ValueError: If ``prioritised`` has other keys than these two.
@@ -79,8 +82,10 @@ class Memory(Checked):
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,
+        example: TensorDictBase | None = None,
     ) -> None:
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
+        self._example = None if example is None else example.to("meta")
         self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         self.is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
@@ -96,6 +101,7 @@ class Memory(Checked):
             MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
             for gamma, keys in keys_of.items()
         ]
+        self._spanned = ["steps_to_next_obs"] if self._sums else []
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -108,8 +114,7 @@ class Memory(Checked):
     def _add(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
             return
-        spanned = ["steps_to_next_obs"] if self._sums else []
-        pieces = [piece.select(*self.in_keys, *spanned) for piece in pieces]
+        pieces = [piece.select(*self.in_keys, *self._spanned) for piece in pieces]
         steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
         self._buffer.extend(steps.reshape(-1))
 
@@ -181,20 +186,44 @@ class Memory(Checked):
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
-        size = state_dict["size"]
+        """Continue from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If entries are missing, or have other shapes or types than the example's.
+        """
+        size, writer = state_dict["size"], state_dict["writer"]
+        if size > self.capacity or writer["_cursor"] not in range(self.capacity):
+            raise ValueError(f"{size} transitions, the next at {writer['_cursor']}, are too many.")
         self._buffer.empty()
         if size:
-            steps = TensorDict(state_dict["steps"], batch_size=[size]).unflatten_keys("/")
-            self._buffer.extend(steps)
-        self._buffer.writer.load_state_dict(state_dict["writer"])
+            self._buffer.extend(self._restored(state_dict["steps"], [size], self._spanned))
+        self._buffer.writer.load_state_dict(writer)
         if self.is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
         self._wait_with(None)
         if self._sums and "tail" in state_dict:
-            # the saved run may have used another device
-            tail = TensorDict(state_dict["tail"], state_dict["tail_shape"], device=self._device)
-            self._wait_with(tail.unflatten_keys("/"))
+            tail, shape = state_dict["tail"], state_dict["tail_shape"]
+            self._wait_with(self._restored(tail, shape, [("next", "done")]))
+
+    def _restored(
+        self, entries: Mapping[str, Tensor], shape: list[int], further: Sequence[NestedKey]
+    ) -> TensorDictBase:
+        """Saved steps of a shape, of these and further entries, compared with the example."""
+        if self._example is not None:
+            expected = self._example.select(*self.in_keys, strict=False).flatten_keys("/")
+            rows = [*self._example.shape, *shape[1:]] if len(shape) > 1 else shape
+            if missing := {*expected.keys(), *map(key_name, further)} - set(entries):
+                raise ValueError(f"there is no '{min(missing)}'.")
+            for key, value in expected.items():
+                found, wanted = torch.as_tensor(entries[key]), [*rows, *value.shape[1:]]
+                if list(found.shape) != wanted or found.dtype != value.dtype:
+                    raise ValueError(
+                        f"'{key}' is {found.dtype} of the shape {list(found.shape)}, expected "
+                        f"{value.dtype} of the shape {wanted}."
+                    )
+        # the saved run may have used another device
+        steps = TensorDict(entries, shape, device=self._device).unflatten_keys("/")
+        return steps.select(*dict.fromkeys([*self.in_keys, *further]))
 
 
 def _read_by(transform: MultiStepTransform) -> list[NestedKey]:

@@ -5,12 +5,15 @@ import shutil
 
 import pytest
 import torch
+from point_mass import PointMass
 from point_mass_runs import point_mass_trainer
+from run_configs import off_policy_config
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.evaluation.loading import load_policy
 from safe_rl.files import load_tensors, save_tensors
 from safe_rl.runs.run import Run
+from safe_rl.training.building import build_trainer, seed_everything
 
 
 @pytest.fixture(scope="module")
@@ -22,15 +25,60 @@ def trained(tmp_path_factory):
     return folder, trainer
 
 
-def change(folder, tmp_path, part, edit):
-    """A copy of the run, its checkpoints with another state of a part."""
+def edited(folder, tmp_path, part, edit):
+    """A copy of a run, its checkpoints with another state of a part."""
     run = shutil.copytree(folder, tmp_path / "run")
-    trainer = point_mass_trainer(run, "frames=480")
     for path in (Run(run).checkpoints_folder / "last").iterdir():
         content = load_tensors(path)
         edit(content["parts"][part])
         save_tensors(path, content)
-    return trainer
+    return run
+
+
+@pytest.fixture(scope="module")
+def off_policy(tmp_path_factory):
+    """A run with a replay buffer of transitions over three steps."""
+    folder = tmp_path_factory.mktemp("off_policy") / "run"
+    off_policy_trainer(folder, "frames=320").run()
+    return folder
+
+
+def off_policy_trainer(folder, frames):
+    config = off_policy_config("algo=sac_lagrangian", "memory.n_steps=3", frames)
+    seed_everything(0, 1)
+    return build_trainer(config, PointMass(4, 20), folder)
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (
+            lambda s: s["steps"].update(observation=torch.ones(308, 3)),
+            r"'observation' is .* \[308, 3\], .* \[308, 4\]",
+        ),
+        (
+            lambda s: s["steps"].update({"next/reward": torch.ones(308, 1).long()}),
+            "'next/reward' is torch.int64",
+        ),
+        (lambda s: s["steps"].update(action=torch.ones(9, 2)), r"'action' is .* \[9, 2\]"),
+        (lambda s: s["steps"].update(action=[1.0]), r"'action' is .* \[1\]"),
+        (lambda s: s["steps"].pop("next/cost"), "there is no 'next/cost'"),
+        (lambda s: s["steps"].pop("steps_to_next_obs"), "there is no 'steps_to_next_obs"),
+        (lambda s: s.update(size=10**9), "are too many"),
+        (lambda s: s["writer"].update(_cursor=-1), "308 transitions, the next at -1"),
+        (lambda s: s["tail"].update(action=torch.ones(4, 3, 1)), r"'action' is .* \[4, 3, 1\]"),
+        (
+            lambda s: s.update(tail={k: v[:2] for k, v in s["tail"].items()}, tail_shape=[2, 3]),
+            r"\[2, 3, .\], .* \[4, 3, .\]",
+        ),
+    ],
+)
+def test_transitions_of_another_kind_are_refused_in_a_line(edit, words, off_policy, tmp_path):
+    run = edited(off_policy, tmp_path, "memory", edit)
+    match = f"checkpoint-000000000320.torchrl: its 'memory' does not fit: .*{words}"
+    with pytest.raises(CheckpointError, match=match) as caught:
+        off_policy_trainer(run, "frames=480").resume()
+    assert str(caught.value).isprintable()
 
 
 def moments(state):
@@ -58,7 +106,7 @@ def moments(state):
     ],
 )
 def test_a_part_of_another_kind_is_refused_in_a_line(part, edit, words, trained, tmp_path):
-    trainer = change(trained[0], tmp_path, part, edit)
+    trainer = point_mass_trainer(edited(trained[0], tmp_path, part, edit), "frames=480")
     with pytest.raises(CheckpointError, match=f"its '{part}' does not fit: .*{words}") as caught:
         trainer.resume()
     assert str(caught.value).isprintable()
@@ -79,7 +127,7 @@ def test_a_policy_of_nan_is_not_evaluated(trained, tmp_path):
         for value in state.values():
             value.fill_(torch.nan)
 
-    trainer = change(trained[0], tmp_path, "actor", edit)
+    trainer = point_mass_trainer(edited(trained[0], tmp_path, "actor", edit), "frames=480")
     path = Run(tmp_path / "run").newest_checkpoint()
     config, env = trainer.writer._config, trainer._env
     with pytest.raises(CheckpointError, match="weights that are NaN or infinite"):
