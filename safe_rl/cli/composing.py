@@ -30,6 +30,7 @@ from safe_rl.cli.config import General, keys_of, unknown_key
 from safe_rl.cli.user_code import check_imports
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
+from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM, read_config
 from safe_rl.naming import did_you_mean
@@ -156,6 +157,9 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     if isinstance(error, ConfigCompositionException) and unknown:
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         return _unknown_key(inner[1] if inner else unknown[1], unknown[1], words)
+    foreign = re.search(r"(?s)In '(\S+)': .*Key '\S+' not in '(\S+)'\s+full_key: (\S+)", str(error))
+    if foreign:
+        return _foreign_key(*foreign.groups())
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
     absent = re.match(r"Missing mandatory value: (\S+)", str(cause or error))
     if absent and absent[1] in General.__annotations__:
@@ -216,6 +220,13 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     if OmegaConf.is_missing(config, section):
         return f"this algorithm has no '{section}'."
     return unknown_key(key, keys_of(config))
+
+
+def _foreign_key(file: str, section: str, key: str) -> str:
+    """A message about a key of a chosen file that other choices do not have."""
+    is_of_ours = key.startswith("env.") and key.removeprefix("env.") in KEYS
+    where = " Environments of Safety Gym have it, such as env=PointGoal1." if is_of_ours else ""
+    return f"{'='.join(file.rsplit('/', 1))} sets '{key}', which {section} does not have.{where}"
 
 
 def check_risk(config: DictConfig) -> None:

@@ -78,6 +78,16 @@ def test_what_only_other_algorithms_have_is_refused(algo, argument, words):
         composed(f"algo={algo}", argument)
 
 
+@pytest.mark.parametrize(
+    ("preset", "algo", "key"),
+    [("privileged", "sac_lagrangian", "observe_privileged"), ("gpu", "cpo", "physics")],
+)
+def test_what_a_preset_sets_and_only_other_environments_have_is_refused(preset, algo, key):
+    message = rf"^preset={preset} sets 'env\.{key}', .*SafeHopperVelocity.* env=PointGoal1\.$"
+    with pytest.raises(ValueError, match=message):
+        composed("env=SafeHopperVelocity", f"algo={algo}", f"preset={preset}")
+
+
 def test_an_algorithm_without_limits_takes_none_from_a_preset():
     (config,) = composed("algo=ppo", "preset=gpu")
     assert "limits" not in config

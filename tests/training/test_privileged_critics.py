@@ -8,7 +8,10 @@ import safe_rl
 from safe_rl.algorithms import OffPolicy, OnPolicy
 from safe_rl.collectors.recording import read_recording
 from safe_rl.envs import make_env
+from safe_rl.evaluation import certify
+from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.policies import pack_policy
+from safe_rl.evaluation.settings import certificate_options
 from safe_rl.models import RunningScale, take_in
 
 READ = {"model.critic_observes": ["observation", "privileged"], "env.observe_privileged": True}
@@ -120,6 +123,23 @@ def test_its_columns_are_normalised():
     assert [scale.key for scale in scales] == ["observation", "privileged"]
     mean = batch["privileged"].flatten(0, 1).double().mean(0)
     torch.testing.assert_close(scales[1].mean, mean)
+
+
+@pytest.mark.long
+def test_a_policy_is_certified_without_it(tmp_path):
+    run = train(tmp_path / "run", "sac", **READ, cost_limits={"cost": 15})
+    made = []
+
+    def make_without(node, **others):
+        made.append(maker_of(run.directory)({**node, "observe_privileged": False}, **others))
+        return made[-1]
+
+    options = certificate_options(run.config, {"ranking": 4, "episodes": 200, "tests": 1})
+    certificate = certify(run.directory, options, make_env=make_without, num_threads=1)
+    assert certificate.checkpoint is not None
+    assert certificate.verdict.bounds["mean_cost"][0] < 15
+    assert made
+    assert not any(env.privileged_layout for env in made)
 
 
 @pytest.mark.long
