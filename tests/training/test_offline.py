@@ -251,6 +251,16 @@ class Wider(PointMass):
         self.observation_spec = spec
 
 
+class Filmed(PointMass):
+    """Of another kind: a picture is observed."""
+
+    def __init__(self):
+        super().__init__(2)
+        spec = self.observation_spec
+        spec["observation"] = type(spec["observation"])((2, 40, 40, 3))
+        self.observation_spec = spec
+
+
 @pytest.mark.parametrize(
     ("overrides", "env", "words"),
     [
@@ -259,6 +269,7 @@ class Wider(PointMass):
         (["+limit=0"], PointMass, "of its 160 transitions 0 are taken in whole"),
         (["memory.capacity=80"], PointMass, "room for them: memory.capacity=80"),
         ([], Wider, "its observations are 4 numbers, those of this environment 5"),
+        (["model=cnn"], Filmed, "has vectors as observations, and this environment has others"),
     ],
 )
 def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):
