@@ -29,7 +29,7 @@ def place(tmp_path):
     """Where the reader is: a folder with the files of the pages, as if in a checkout."""
     for name in ("train.py", "conf"):
         (tmp_path / name).symlink_to(ROOT / name)
-    for page in WALK:
+    for page in (*WALK, "guides/observations.md"):
         for name, text in FILE.findall((DOCS / page).read_text()):
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_text(text)
@@ -115,3 +115,9 @@ def test_from_nothing_to_a_dataset_and_to_policies_that_learn_from_it_alone(plac
     carry_out([word.replace("episodes=200", "episodes=40") for word in recorded], place)
     for words in (("algo=bc",), ("algo=sac_lagrangian", "dataset.alone=true")):
         assert "Learning from" in carry_out(command(page, *words), place, fresh=True)
+
+
+def test_a_recurrent_policy_learns_from_a_replay_buffer(place):
+    words = command("guides/observations.md", "my_memory.gru")
+    carry_out([*words, "exploration.random_steps=200", "memory.batch_size=32"], place)
+    assert (place / "runs/one/progress.csv").is_file()
