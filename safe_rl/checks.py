@@ -58,7 +58,7 @@ Text = Annotated[
 
 
 def check_value(name: str, annotation: Any, value: Any) -> Any:
-    """Return a value if an annotation allows it.
+    """Return a value if an annotation, or the `adapter` of one, allows it.
 
     A boolean is no number, a text is no number, and numbers are finite. Where whole numbers are
     meant, 3e5, which YAML reads as a float, is returned as one.
@@ -74,23 +74,20 @@ def check_value(name: str, annotation: Any, value: Any) -> Any:
         ...
         safe_rl.checks.SettingError: gamma=2: it must be less than or equal to 1.
     """
-    return _checked_by(adapter(annotation), name, value)
+    check = annotation if isinstance(annotation, TypeAdapter) else adapter(annotation)
+    try:
+        check.validate_python(value)
+    except ValidationError as error:
+        if isinstance(value, float) and value.is_integer():
+            return check_value(name, check, int(value))
+        raise SettingError(f"{name}={_shown(value)}: {_words(error)}.") from None
+    return value
 
 
 def adapter(annotation: Any) -> TypeAdapter[Any]:
     """Pydantic's check of a type, as strict as `check_value` describes."""
     config = ConfigDict(strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
     return TypeAdapter(annotation, config=config)
-
-
-def _checked_by(check: TypeAdapter[Any], name: str, value: Any) -> Any:
-    try:
-        check.validate_python(value)
-    except ValidationError as error:
-        if isinstance(value, float) and value.is_integer():
-            return _checked_by(check, name, int(value))
-        raise SettingError(f"{name}={_shown(value)}: {_words(error)}.") from None
-    return value
 
 
 def _shown(value: Any) -> str:
@@ -182,7 +179,7 @@ def checked(function: Function) -> Function:
         given = dict(zip(signature(function).parameters, args, strict=False)) | kwargs
         for name, check in checks().items():
             if name in given and isinstance(given[name], _PLAIN):
-                value = _checked_by(check, name, given[name])
+                value = check_value(name, check, given[name])
                 kwargs |= {name: value} if name in kwargs else {}
         return function(*args, **kwargs)
 

@@ -7,9 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
-
-T = TypeVar("T")
+from typing import Any
 
 _PLUGINS = {
     "hydra/launcher=joblib": "sweep",
@@ -62,16 +60,6 @@ def import_extra(module: str, extra: str) -> Any:
     """Import a module that comes with one of the extras, after :func:`require_extra`."""
     require_extra(module, extra)
     return import_module(module)
-
-
-def needs_extra(module: str, extra: str) -> Callable[[T], T]:
-    """Mark a class or function that needs a package of an extra; `check_settings` checks this."""
-
-    def note(part: T) -> T:
-        part.needed_extra = (module, extra)  # type: ignore[attr-defined]
-        return part
-
-    return note
 
 
 def import_later(

@@ -26,7 +26,7 @@ from safe_rl.collectors import (
     safety_gymnasium_columns,
 )
 from safe_rl.files import read_config
-from safe_rl.models.bounded_actors import bounded_actions
+from safe_rl.models.replay_networks import bounded_actions
 
 _ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
 
@@ -79,8 +79,12 @@ def _other_environment(config: DictConfig) -> str:
         name = read_config(Path(config.dataset.path).parent / "config.yaml")["env"]["name"]
     except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
         return ""
-    own = config.env.name
-    return "" if name == own else f" Warning: they are of {name}, and this environment is {own}."
+    name_here = config.env.name
+    return (
+        ""
+        if name == name_here
+        else f" Warning: they are of {name}, and this environment is {name_here}."
+    )
 
 
 def _fill(
@@ -121,13 +125,13 @@ def _arrange(
     steps: TensorDictBase, interface: Mapping[str, Any], node: DictConfig, env: EnvBase
 ) -> str:
     """Put the columns of observations into the environment's order; return a warning, or ""."""
-    columns, own = interface.get("columns"), env.column_names
+    columns, here = interface.get("columns"), env.column_names
     if columns is None and node.get("columns") == "safety_gymnasium":
-        columns = safety_gymnasium_columns(own)
+        columns = safety_gymnasium_columns(here)
     if columns is not None:
         sensors = interface.get("sensors"), env.sensor_keys
-        order = match_columns(columns, own, *sensors)
-        if order != [*range(len(own))]:
+        order = match_columns(columns, here, *sensors)
+        if order != [*range(len(here))]:
             for key in ("observation", ("next", "observation")):
                 steps[key] = steps[key][..., order]
         return ""
@@ -141,10 +145,10 @@ def _arrange(
         beyond = (seen < spec.low[0].cpu() - 1e-3) | (seen > spec.high[0].cpu() + 1e-3)
         if number := int(beyond.any(0).sum()):
             raise ValueError(
-                f"{number} of the {len(own)} columns of its observations leave the bounds of this "
+                f"{number} of the {len(here)} columns of its observations leave the bounds of this "
                 "environment's: their order is another one. Files of Safety-Gymnasium and DSRL "
                 "need dataset.columns=safety_gymnasium; others can name their columns in the "
-                f"attribute observation_columns: {own[0]}, …"
+                f"attribute observation_columns: {here[0]}, …"
             )
     return " Warning: it does not name the columns of its observations, which are used as they are."
 
@@ -160,18 +164,18 @@ def _as_chosen(
     Raises:
         ValueError: If actions of a file, or of another environment, are outside the bounds.
     """
-    chosen, own = (
+    chosen, raw = (
         [spec.low.cpu(), spec.high.cpu()],
         [bound.flatten() for bound in env.action_bounds],
     )
     if is_recorded:
-        recorded = _recorded_bounds(interface, chosen + own)
+        recorded = _recorded_bounds(interface, chosen + raw)
         action = action.clamp(*recorded[:2])
-        if all(map(torch.equal, recorded, chosen + own)):
+        if all(map(torch.equal, recorded, chosen + raw)):
             return action
         action = _rescaled(action, recorded[:2], recorded[2:])
-    _check_bounds(action, *own)
-    return _rescaled(action, own, chosen).clamp(*chosen)
+    _check_bounds(action, *raw)
+    return _rescaled(action, raw, chosen).clamp(*chosen)
 
 
 def _recorded_bounds(interface: Mapping[str, Any], otherwise: list[Tensor]) -> list[Tensor]:

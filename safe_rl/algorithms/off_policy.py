@@ -20,7 +20,6 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy, QEnsemble
-from safe_rl.models.bounded_actors import bounded_actions
 from safe_rl.models.encoders import (
     Codes,
     Observed,
@@ -28,6 +27,7 @@ from safe_rl.models.encoders import (
     critic_entries,
     observed_entries,
 )
+from safe_rl.models.replay_networks import bounded_actions
 from safe_rl.objectives import CostValues, MeanCosts, Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable

@@ -121,18 +121,18 @@ class Memory(Checked):
     def _summed(self, batch: TensorDictBase) -> list[TensorDictBase]:
         """Transitions over n steps, piece by piece; the transforms remember earlier steps."""
         wanted = batch.select(*{("next", "done"), *self.in_keys})
-        found = [self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
-        return [piece for piece in found if piece is not None]
+        pieces = [self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
+        return [piece for piece in pieces if piece is not None]
 
     def _over_steps(self, piece: TensorDictBase) -> TensorDictBase | None:
         """Transitions over n steps; None if there are fewer than n steps so far."""
         first, *others = self._sums
-        found: TensorDictBase | None = first.inv(piece)
+        transitions: TensorDictBase | None = first.inv(piece)
         for transform in others:
             sums = transform.inv(piece.select(*_read_by(transform)))
-            if found is not None:
-                found["next"].update(sums["next"].select(*transform.reward_keys))
-        return found
+            if transitions is not None:
+                transitions["next"].update(sums["next"].select(*transform.reward_keys))
+        return transitions
 
     def end_rows(self) -> None:
         """Complete the sums over n steps, because the next batch does not follow the last one."""

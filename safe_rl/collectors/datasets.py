@@ -246,11 +246,11 @@ def _is_array(node: Any) -> bool:
 
 
 def _arrays(place: Path | str, nodes: Mapping[str, Any], names: Mapping[NestedKey, str]) -> Arrays:
-    found = [name for name, node in nodes.items() if _is_array(node)]
-    if missing := sorted(set(names.values()) - set(found)):
+    present = [name for name, node in nodes.items() if _is_array(node)]
+    if missing := sorted(set(names.values()) - set(present)):
         raise ValueError(
             f"{place} has no {', '.join(missing)}: transitions are read from files like those of "
-            f"DSRL or Minari. What it has: {printable(', '.join(found)) or 'nothing'}."
+            f"DSRL or Minari. What it has: {printable(', '.join(present)) or 'nothing'}."
         )
     arrays = {key: _values(place, nodes[name]) for key, name in names.items()}
     return arrays | {key: arrays[key].astype(bool) for key in _FLAGS}

@@ -42,15 +42,15 @@ def read_interface(folder: Path | str) -> dict[str, Any]:
 
 
 def match_columns(
-    columns: Any, own: Sequence[str], sensors: Any = None, own_sensors: Mapping[str, Any] = {}
+    columns: Any, wanted: Sequence[str], sensors: Any = None, of_env: Mapping[str, Any] = {}
 ) -> list[int]:
     """Where in other columns the columns of an environment are, by their names.
 
     Args:
         columns: Names of the other columns, of unknown origin.
-        own: ``column_names`` of the environment.
+        wanted: ``column_names`` of the environment.
         sensors: ``sensor_keys`` of the other columns; None: unknown.
-        own_sensors: ``sensor_keys`` of the environment.
+        of_env: ``sensor_keys`` of the environment.
 
     Raises:
         ValueError: If names or keys differ; the message says which.
@@ -64,21 +64,21 @@ def match_columns(
     """
     if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
         raise ValueError("their columns are not a list of names")
-    if sorted(columns) != sorted(own):
+    if sorted(columns) != sorted(wanted):
         others, missing = (
             ", ".join(dict.fromkeys(name.partition("[")[0] for name in names)) or "nothing"
             for names in (
-                [name for name in columns if name not in own],
-                [name for name in own if name not in columns],
+                [name for name in columns if name not in wanted],
+                [name for name in wanted if name not in columns],
             )
         )
         raise ValueError(printable(f"they have {others}, where this environment has {missing}"))
-    for key, value in own_sensors.items():
+    for key, value in of_env.items():
         if isinstance(sensors, dict) and sensors.get(key, value) != value:
             raise ValueError(
                 printable(f"their {key} is {sensors[key]}, and that of this environment {value}")
             )
-    return [columns.index(name) for name in own]
+    return [columns.index(name) for name in wanted]
 
 
 class Recording:

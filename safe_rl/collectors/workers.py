@@ -29,7 +29,6 @@ from torchrl.envs import EnvBase
 
 from safe_rl.checks import checked
 from safe_rl.collectors.processes import leave_signals_to_parent, starting_processes
-from safe_rl.extras import needs_extra
 
 
 class MakeEnv(Protocol):
@@ -305,7 +304,6 @@ def make_process_collector(  # noqa: D417
     return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
 
 
-@needs_extra("ray", "ray")
 @checked
 def make_ray_collector(  # noqa: D417
     env: EnvBase,
@@ -323,8 +321,7 @@ def make_ray_collector(  # noqa: D417
     Args:
         num_collectors: Number of actors W, which divides N.
         ray_init: Arguments of ``ray.init``, such as ``address``; not used if Ray runs already in
-            this process. With ``log_to_driver: true``, the output of the actors is also printed
-            here, not only to Ray's log files.
+            this process. With ``log_to_driver: true``, actors also print here, not only to files.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
     import ray
@@ -348,3 +345,6 @@ def make_ray_collector(  # noqa: D417
     if not ray.is_initialized():
         ray.init(**{"log_to_driver": False, **ray_init})
     return workers
+
+
+make_ray_collector.needed_extra = ("ray", "ray")  # type: ignore[attr-defined]

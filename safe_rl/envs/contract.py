@@ -97,9 +97,14 @@ class ConstrainedEnv(EnvBase):
         actions as policies choose them, ``low`` and ``high``, and in the environment's own units,
         ``own_low`` and ``own_high``; None for choices.
         """
-        own, spec, actions = self.action_bounds, self.action_spec_unbatched, None
-        if own is not None:
-            bounds = {"low": spec.low, "high": spec.high, "own_low": own[0], "own_high": own[1]}
+        raw, spec, actions = self.action_bounds, self.action_spec_unbatched, None
+        if raw is not None:
+            bounds = {
+                "low": spec.low,
+                "high": spec.high,
+                "own_low": raw[0],
+                "own_high": raw[1],
+            }
             actions = {name: bound.flatten().tolist() for name, bound in bounds.items()}
         sensors = dict(self.sensor_keys)
         return {"columns": self.column_names, "sensors": sensors, "actions": actions}
@@ -195,10 +200,10 @@ def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[s
         >>> add_columns({"gyro": slice(0, 3)}, {"lidar": 16})
         {'gyro': slice(0, 3, None), 'lidar': slice(3, 19, None)}
     """
-    found, first = dict(layout), max((columns.stop for columns in layout.values()), default=0)
+    extended, first = dict(layout), max((columns.stop for columns in layout.values()), default=0)
     for name, size in sizes.items():
-        found[name], first = slice(first, first + size), first + size
-    return found
+        extended[name], first = slice(first, first + size), first + size
+    return extended
 
 
 _DEFAULTS = (
@@ -268,9 +273,9 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
     steps = getattr(env, "max_episode_steps", None)
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."
-    own, default = type(env), ConstrainedEnv
-    stores = isinstance(env, default) and own.get_state is not default.get_state
-    if stores and own.set_state in (None, default.set_state):
+    kind, base = type(env), ConstrainedEnv
+    stores = isinstance(env, base) and kind.get_state is not base.get_state
+    if stores and kind.set_state in (None, base.set_state):
         yield "it has 'get_state', so it needs 'set_state' too."
 
 

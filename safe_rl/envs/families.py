@@ -324,17 +324,17 @@ def make_env(
             f"{target}: {error}. It is called with the keys of env as the first argument, and with "
             f"{', '.join(given)} by name."
         ) from None
-    made = build(node, **given)
+    batch = build(node, **given)
     if transforms:
-        made = transform_env(made, transforms, evaluating=evaluating, seed=seed)
+        batch = transform_env(batch, transforms, evaluating=evaluating, seed=seed)
     if target is not None or transforms:
-        check_constrained_env(made)
-    if list(made.batch_size) != [num_envs]:
-        number = made.batch_size[0]
+        check_constrained_env(batch)
+    if list(batch.batch_size) != [num_envs]:
+        number = batch.batch_size[0]
         raise ContractError(
             f"{target} made {number} environments instead of {num_envs}, 'num_envs'."
         )
-    return made
+    return batch
 
 
 # `Safexp-{name}-v0`, and `Safexp-Custom-v0` with the default of every key. They take a `config`

@@ -34,18 +34,13 @@ def on_cpu_only(key: str) -> str:
     )
 
 
-def require_integer(name: str, value: Any, lowest: int) -> None:
-    """Raise ConfigError unless an argument is an integer from `lowest` to 2⁶³ - 1."""
-    if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value < 2**63:
-        words = f"an integer of at least {lowest} and below 2**63"
-        raise ConfigError(f"'{name}' must be {words}, got {value!r}.")
-
-
 # float32 can hold the square of the largest number
 Number = Annotated[float, Interval(ge=-1e9, le=1e9)]
 Positive = Annotated[float, Interval(gt=0, le=1e9)]
 NotNegative = Annotated[float, Interval(ge=0, le=1e9)]
 Count = Annotated[int, Interval(ge=1, le=10**15)]
+Seed = Annotated[int, Interval(ge=0, lt=2**63)]
+Threads = Annotated[int, Interval(ge=0, le=10**6)]
 _RANGE = rule(lambda row: row[0] <= row[1], "a factor, or the lowest and the highest one")
 Factor = Positive | Annotated[tuple[Positive, Positive], _RANGE]
 """A factor, or the range from which one is drawn for every episode."""

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.keys import ConfigError, require_integer
+from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, checked
 from safe_rl.envs.physics import BatchPhysics, Physics
 from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
 
@@ -57,8 +57,8 @@ class SimulatedEnv(ConstrainedEnv):
     _observer: Any
 
     def __init__(self, num_envs: int, device: torch.device | str, num_threads: int) -> None:
-        require_integer("num_envs", num_envs, lowest=1)
-        require_integer("num_threads", num_threads, lowest=0)
+        num_envs = checked("num_envs", Count, num_envs)
+        checked("num_threads", Threads, num_threads)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self._physics_settings: tuple[Any, ...] = (num_threads,)
 
@@ -123,14 +123,14 @@ class SimulatedEnv(ConstrainedEnv):
             raise ValueError(f"There must be {self.batch_size[0]} seeds, got {len(seeds)}.")
         for row, seed in enumerate(seeds):
             if seed is not None:
-                require_integer("seed", seed, lowest=0)
+                checked("seed", Seed, seed)
                 self._row_seed[row] = rng.row_seeds(seed, 1)[0]
                 self._episode[row] = 0
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             return
-        require_integer("seed", seed, lowest=0)
+        seed = checked("seed", Seed, seed)
         self._row_seed = rng.row_seeds(seed, self.batch_size[0], self._physics.device)
         self._episode.zero_()
 

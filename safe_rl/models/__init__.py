@@ -1,6 +1,5 @@
 """Networks: actors, critics, and fast policies for data collection."""
 
-from safe_rl.models.bounded_actors import make_bounded_actor, make_squashed_actor
 from safe_rl.models.build_networks import build_networks
 from safe_rl.models.collecting_policies import (
     BehaviourPolicy,
@@ -10,7 +9,12 @@ from safe_rl.models.collecting_policies import (
 )
 from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector, take_in
 from safe_rl.models.networks import make_actor, make_critic
-from safe_rl.models.q_networks import EnsembleMLP, QEnsemble
+from safe_rl.models.replay_networks import (
+    EnsembleMLP,
+    QEnsemble,
+    make_bounded_actor,
+    make_squashed_actor,
+)
 
 __all__ = [
     "BehaviourPolicy",

@@ -120,11 +120,11 @@ class Observed(NamedTuple):
 
     def scales(self) -> Tensor | None:
         """Factors of the columns of all entries, which are vectors; None if all are 1."""
-        found = [self.scale(entry) for entry in self.entries]
-        if all(scale is None for scale in found):
+        factors = [self.scale(entry) for entry in self.entries]
+        if all(scale is None for scale in factors):
             return None
         sizes = [entry.shape[0] for entry in self.entries]
-        parts = zip(found, sizes, strict=True)
+        parts = zip(factors, sizes, strict=True)
         return torch.cat([torch.ones(n) if scale is None else scale for scale, n in parts])
 
 

@@ -176,7 +176,7 @@ class CriticLoss(SharesTensors):
             )
         error = (value - target).square().sum(-1)
         mask = sample_mask(tensordict, self)
-        found, wanted = value.detach(), target
+        predicted, wanted = value.detach(), target
         if mask is not None:
-            found, wanted = found[mask], wanted[mask]
-        return self._reduce_loss(error, tensordict), explained_variance(found, wanted)
+            predicted, wanted = predicted[mask], wanted[mask]
+        return self._reduce_loss(error, tensordict), explained_variance(predicted, wanted)

@@ -157,9 +157,9 @@ def composite_keys(
     sampler: ProbabilisticTensorDictModule,
 ) -> tuple[list[NestedKey], list[NestedKey]] | None:
     """Keys of the parts' actions and log-probabilities; None if it is not composite."""
-    made = sampler.distribution_class
-    made = made.func if isinstance(made, partial) else made
-    if made is not CompositeDistribution:
+    kind = sampler.distribution_class
+    kind = kind.func if isinstance(kind, partial) else kind
+    if kind is not CompositeDistribution:
         return None
     return list(sampler.dist_sample_keys), list(sampler.log_prob_keys)
 

@@ -125,16 +125,6 @@ class LimitState:
         return replace(self, **tensors)
 
 
-def descend(start: Tensor, goal: Tensor, share: float) -> Tensor:
-    """Interpolate from `start` down to `goal`; the result is never above `start` or below `goal`.
-
-    Examples:
-        >>> descend(torch.tensor([65.0, 5.0]), torch.tensor([25.0, 25.0]), share=0.75)
-        tensor([35., 25.])
-    """
-    return goal + (start - goal).clamp_min(0) * (1 - min(max(share, 0.0), 1.0))
-
-
 class PredictedChange(Resumable):
     """Share of predicted changes of J_c that was observed, by a regression through the origin.
 
@@ -329,6 +319,6 @@ class LimitTracker(Checked, Resumable):
         left = self.free_steps + self.descent_steps - self._steps + num_steps
         share = num_steps / left if left > num_steps else 1.0
         # if the cost is already below the falling limit, the limit continues from the cost
-        self._reached = torch.minimum(self._reached, estimate.mean)
-        self._reached = descend(self._reached, self.limits - margin, share)
+        reached, goal = torch.minimum(self._reached, estimate.mean), self.limits - margin
+        self._reached = goal + (reached - goal).clamp_min(0) * (1 - share)
         return self._reached

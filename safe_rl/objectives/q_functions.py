@@ -220,11 +220,11 @@ class QFunctionLoss(ReplayLoss):
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> LossModule | None:
         """As in TorchRL; the estimator's ``gamma`` is also used for the cost critics."""
-        made = super().make_value_estimator(value_type, **hyperparams)
+        estimator = super().make_value_estimator(value_type, **hyperparams)
         if isinstance(value_type, ValueEstimatorBase):
             hyperparams = {"gamma": value_type.gamma.item()}
         self.gamma = hyperparams.get("gamma", self.gamma)
-        return made
+        return estimator
 
     def __getstate__(self) -> dict[str, Any]:
         # a copy must not have the cached parameters, which belong to the original loss

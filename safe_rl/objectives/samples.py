@@ -29,7 +29,7 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
     value = tensordict.get(key, None)
     if value is not None:
         return value
-    present = {key_name(found): found for found in tensordict.keys(True, True)}
+    present = {key_name(entry): entry for entry in tensordict.keys(True, True)}
     near = nearest(key_name(unravel_key(key)), present)
     meant = "" if near is None else f" Did you mean {present[near]!r}?"
     raise KeyError(f"No entry {key!r} in the batch.{meant} Keys: {sorted(present)}. {hint}".strip())

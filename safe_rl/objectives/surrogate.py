@@ -246,7 +246,7 @@ class SurrogateLoss(Checked, SharesTensors):
         """KL(π_θ ‖ π_k) per state, [...]."""
         hint = "It is the behaviour policy's, stored when the action was sampled."
         keys = self.behaviour_keys.items()
-        stored = TensorDict({key: require(tensordict, found, hint) for key, found in keys})
+        stored = TensorDict({key: require(tensordict, place, hint) for key, place in keys})
         behaviour = self.actor_network.build_dist_from_params(stored)
         return kl(distribution, behaviour, log_weight.squeeze(-1), tensordict)
 

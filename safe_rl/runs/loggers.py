@@ -18,7 +18,7 @@ from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTenso
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 
 from safe_rl.checks import Text, checked
-from safe_rl.extras import import_extra, needs_extra
+from safe_rl.extras import import_extra
 from safe_rl.files import read_text, replace_text
 from safe_rl.runs.run import Run
 
@@ -75,7 +75,6 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
         self.experiment.close()
 
 
-@needs_extra("mlflow", "mlflow")
 @checked
 class MLflowLogger(MLFlowLogger, ResumableLogger):
     """A run of an MLflow experiment; a continued run uses the same MLflow run.
@@ -90,6 +89,8 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
     Raises:
         ModuleNotFoundError: If MLflow is not installed.
     """
+
+    needed_extra = ("mlflow", "mlflow")
 
     def __init__(self, exp_name: Text, tracking_uri: Text, log_dir: str) -> None:
         self._mlflow = import_extra("mlflow", extra="mlflow")
@@ -112,7 +113,6 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
         self._mlflow.end_run()
 
 
-@needs_extra("wandb", "wandb")
 @checked
 class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     """A run of Weights & Biases; a continued run uses the same W&B run.
@@ -127,6 +127,8 @@ class WandbLogger(TorchRLWandbLogger, ResumableLogger):
     Raises:
         ModuleNotFoundError: If wandb is not installed.
     """
+
+    needed_extra = ("wandb", "wandb")
 
     def __init__(
         self, exp_name: Text, project: Text, offline: bool, log_dir: str, **kwargs: Any

@@ -231,7 +231,7 @@ def test_a_copy_continues_as_the_original_does(copied):
         (Counter(), {}, "an id, or a function that makes an environment; got <.*Counter"),
         (lambda: 3, {}, "must return a gymnasium.Env.*returned 3"),
         (Counter, {"num_env": 2}, "'num_env' is for gymnasium.make.*Did you mean 'num_envs'"),
-        (Counter, {"num_envs": 0}, "'num_envs' must be an integer of at least 1"),
+        (Counter, {"num_envs": 0}, "num_envs=0: it must be greater than or equal to 1"),
         (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*need flatten=False"),
     ],
 )

@@ -90,7 +90,7 @@ def test_names_of_families_and_of_2019_are_known():
     assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"
     with pytest.raises(ConfigError, match="'PointGoal1' is a built-in environment"):
         store_config("PointGoal1", {"hazards_num": 3})  # make_env would make the built-in one
-    with pytest.raises(ConfigError, match="'seed' must be an integer of at least 0"):
+    with pytest.raises(ConfigError, match="seed=-1: it must be greater than or equal to 0"):
         make_env("PointGoal1", seed=-1)
     with pytest.raises(ConfigError, match=r"'num_env'.*Did you mean 'num_envs'"):
         make_env("PointGoal1", num_env=3)

@@ -121,7 +121,7 @@ def test_what_does_not_fit_is_said(observed, model, message):
 
 
 RECALL = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Recall-v0", "num_steps": 5}
-MEMORY = {"memory": {"_target_": "safe_rl.envs.transforms.PolicyMemory", "size": 4}}
+MEMORY = {"memory": {"_target_": "safe_rl.envs.transforms.RecurrentState", "size": 4}}
 
 
 def remembering(num_envs=3, frames=36):

@@ -15,7 +15,7 @@ from safe_rl.models import (
     make_bounded_actor,
     make_squashed_actor,
 )
-from safe_rl.models.bounded_actors import SquashedNormal
+from safe_rl.models.replay_networks import SquashedNormal
 
 LOW, HIGH = torch.tensor([-1.0, -3.0]), torch.tensor([1.0, 5.0])
 

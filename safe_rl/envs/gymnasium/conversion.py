@@ -14,7 +14,7 @@ from torchrl.envs import GymWrapper
 
 from safe_rl.envs.families import FOREIGN, complete_foreign
 from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
-from safe_rl.envs.keys import COST, ConfigError, is_cost, require_integer
+from safe_rl.envs.keys import COST, ConfigError, Count, checked, is_cost
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
@@ -73,7 +73,7 @@ def from_gymnasium(
         >>> env.rollout(3)["next", "cost_hazards"].shape
         torch.Size([2, 3, 1])
     """
-    require_integer("num_envs", num_envs, lowest=1)
+    checked("num_envs", Count, num_envs)
     make = _maker(env, kwargs, num_steps)
     keys, length = _describe(make, cost_keys, num_steps, outside)
     config = {"cost_keys": keys, "num_steps": length, "outside": outside, "flatten": flatten}
@@ -180,7 +180,7 @@ def _make_node(
     config = complete_foreign(FOREIGN[family], config)
     make = maker(config)
     try:
-        require_integer("num_envs", num_envs, lowest=1)
+        checked("num_envs", Count, num_envs)
         return _batch(make, config, num_envs, None if seed is None else spread_seed(seed), device)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
@@ -201,7 +201,7 @@ def _describe(
     make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, outside: Any
 ) -> tuple[list[str], int]:
     if num_steps is not None:
-        require_integer("num_steps", num_steps, lowest=1)
+        checked("num_steps", Count, num_steps)
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
     if cost_keys is not None and num_steps is not None:  # environments may be slow to make
@@ -240,10 +240,10 @@ def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEn
 
 
 def _checked(make: MakeEnv) -> gymnasium.Env:
-    made = make()
-    if not isinstance(made, gymnasium.Env):
-        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {made!r}.")
-    return made
+    env = make()
+    if not isinstance(env, gymnasium.Env):
+        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {env!r}.")
+    return env
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:

@@ -105,20 +105,20 @@ class CheckedSteps(gymnasium.Wrapper):
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset, and check what is returned."""
         self._step = 0
-        found = self._ask(self.env.reset, **kwargs)
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise self._wrong("what a reset returns", "(observation, info)", found)
-        observation, info = found
+        answer = self._ask(self.env.reset, **kwargs)
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise self._wrong("what a reset returns", "(observation, info)", answer)
+        observation, info = answer
         self._check("observation", self.observation_space, observation)
         return observation, {} if info is None else info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step, check what is returned, and convert the costs."""
         self._step += 1
-        found = self._ask(self.env.step, action)
-        if not isinstance(found, tuple):
-            raise self._wrong("what a step returns", "a tuple", found)
-        *values, info = found
+        answer = self._ask(self.env.step, action)
+        if not isinstance(answer, tuple):
+            raise self._wrong("what a step returns", "a tuple", answer)
+        *values, info = answer
         if len(values) != 4:
             raise ConfigError(
                 f"A step of {self.env} returned {len(values) + 1} values instead of five. If its "

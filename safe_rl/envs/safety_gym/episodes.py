@@ -187,8 +187,10 @@ def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     if "goal" in plan.names:
         # As in the benchmark, the first goal is drawn again after all objects are placed, so it is
         # a second draw. Where no place is found, the first draw remains.
-        position, found = resample_goal(plan, physics, rng.fold(key, Purpose.FIRST_GOAL), layouts)
-        put(layouts[:, plan.goal_column], found, position)
+        position, is_placed = resample_goal(
+            plan, physics, rng.fold(key, Purpose.FIRST_GOAL), layouts
+        )
+        put(layouts[:, plan.goal_column], is_placed, position)
     return layouts
 
 
@@ -301,10 +303,10 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
         _choose_button(world, rng.fold(key, Purpose.BUTTON), mask)
         return torch.zeros_like(mask)
     goal_key, column = rng.fold(key, Purpose.GOAL), plan.goal_column
-    position, found = resample_goal(plan, physics, goal_key, _current(world), mask)
-    put(world.positions[:, column - 1, :2], found, position)
-    put(world.layout[:, column], found, position)
-    stuck = mask & ~found
+    position, is_placed = resample_goal(plan, physics, goal_key, _current(world), mask)
+    put(world.positions[:, column - 1, :2], is_placed, position)
+    put(world.layout[:, column], is_placed, position)
+    stuck = mask & ~is_placed
     if not config.terminate_resample_failure:
         physics.check(
             stuck,

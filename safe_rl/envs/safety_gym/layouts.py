@@ -171,10 +171,10 @@ def _place(plan: PlacementPlan, item: int, key: Tensor, placed: Tensor) -> tuple
         tries = rng.fold(key[pending, None], numbers)
         candidates = _draw(plan, item, tries)
         fits = _fits(candidates, placed[pending], clearance)
-        found, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
-        rows = pending[found]
-        position[rows] = candidates[found, first[found]]
-        pending = pending[~found]
+        is_placed, first = fits.any(-1), fits.to(torch.uint8).argmax(-1)
+        rows = pending[is_placed]
+        position[rows] = candidates[is_placed, first[is_placed]]
+        pending = pending[~is_placed]
         if not len(pending):
             break
     return position, torch.ones_like(key, dtype=torch.bool).index_fill(0, pending, False)
@@ -218,10 +218,10 @@ def sample_layouts(plan: PlacementPlan, key: Tensor) -> Tensor:
         positions, misfit = _try_layouts(plan, attempts.flatten())
         misfits += torch.bincount(misfit[misfit >= 0], minlength=len(misfits))
         good = (misfit < 0).view(len(pending), stop - start)
-        found, first = good.any(-1), good.to(torch.uint8).argmax(-1)
-        chosen = positions.view(*good.shape, len(plan.names), 2)[found, first[found]]
-        layouts[pending[found].unsqueeze(1), columns] = chosen
-        pending = pending[~found]
+        has_layout, first = good.any(-1), good.to(torch.uint8).argmax(-1)
+        chosen = positions.view(*good.shape, len(plan.names), 2)[has_layout, first[has_layout]]
+        layouts[pending[has_layout].unsqueeze(1), columns] = chosen
+        pending = pending[~has_layout]
         if not len(pending):
             return layouts
         if len(pending) == len(key) and _is_hopeless(misfits):
@@ -283,8 +283,8 @@ def resample_goal(
         fits = _fits(candidates, placed[rows], clearance)
         first = fits.to(torch.uint8).argmax(-1)
         chosen = candidates.gather(1, first.view(-1, 1, 1).expand(-1, 1, 2))[:, 0]
-        found = fits.any(-1) & missing[rows]
-        position[rows] = torch.where(found.unsqueeze(-1), chosen.to(position), position[rows])
-        missing = missing.index_put((rows,), missing[rows] & ~found)
+        is_placed = fits.any(-1) & missing[rows]
+        position[rows] = torch.where(is_placed.unsqueeze(-1), chosen.to(position), position[rows])
+        missing = missing.index_put((rows,), missing[rows] & ~is_placed)
         start, block = stop, 4 * block
     return position, wanted & ~missing

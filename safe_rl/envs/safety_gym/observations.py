@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import torch
@@ -243,35 +243,35 @@ def make_observer(scene: Scene, device: torch.device, others: Sequence[Block] = 
         values = torch.cat([block.read(world) for block in blocks], -1)
         return values.to(torch.float32).index_select(1, permutation)
 
-    bounds = {name: block.bounds for block in blocks for name in block.shapes}
-    return Observer(shapes, columns, read, bounds)
+    return Observer(
+        shapes, columns, read, {n: block.bounds for block in blocks for n in block.shapes}
+    )
 
 
 def observation_spec(
     config: SafetyGymConfig, observer: Observer, num_envs: int, device: torch.device | None
 ) -> TensorSpec:
     """Return the spec of one flat vector, or of every component in its shape, with bounds."""
-    kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
     bounds = {name: torch.tensor(observer.bounds[name]) for name in observer.shapes}
     if config.observation_flatten:
         widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
         flat = torch.stack(list(bounds.values()), 1).repeat_interleave(widths, dim=1)
-        return _within(flat, (num_envs, flat.shape[1]), kind)
+        return _within(flat, (num_envs, flat.shape[1]), device)
     components = {
-        name: _within(bounds[name], (num_envs, *shape), kind)
+        name: _within(bounds[name], (num_envs, *shape), device)
         for name, shape in observer.shapes.items()
     }
     return Composite(components, shape=(num_envs,))
 
 
-def _within(bounds: Tensor, shape: tuple[int, ...], kind: dict[str, Any]) -> TensorSpec:
+def _within(bounds: Tensor, shape: tuple[int, ...], device: torch.device | None) -> TensorSpec:
     """Return the spec of numbers within (low, high); an infinite bound gets a very large one."""
     if bounds.isinf().all():
-        return Unbounded(shape=shape, **kind)
+        return Unbounded(shape=shape, dtype=torch.float32, device=device)
     # half of the largest number, so that the width of the range is finite
-    far = torch.finfo(kind["dtype"]).max / 2
+    far = torch.finfo(torch.float32).max / 2
     low, high = (bound.clamp(-far, far).expand(shape).clone() for bound in bounds)
-    return Bounded(low, high, shape=shape, **kind)
+    return Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
 
 
 TRACE_DECAY = 0.95
@@ -281,16 +281,13 @@ TRACE_DECAY = 0.95
 class Privileged:
     """Computes the entry `privileged` of N worlds, which critics may read and actors never do.
 
-    Critics exist only in training. So they may know what no sensor shows: what steps cost, where
-    all objects are and how they move, in the robot's frame (Pinto et al. 2018, "Asymmetric Actor
-    Critic for Image-Based Robot Learning").
+    Critics exist only in training, so they may know what no sensor shows (Pinto et al. 2018,
+    "Asymmetric Actor Critic for Image-Based Robot Learning"). Vectors are in the robot's frame.
 
     Its components are `last_costs` and `cost_traces` (a column per cost key), `<kind>_position`
     and, of bodies that can be pushed, `<kind>_velocity` (x, y, z of every object; m, m/s),
     `buttons_timer` (steps until buttons have an effect again, as a share of those after a goal) and
     `since_goal` (steps since the goal changed, as a share of the longest episode).
-
-    The key `observe_privileged` is true for all of them, or names some.
 
     Args:
         world: The worlds.
@@ -312,12 +309,11 @@ class Privileged:
         sizes |= {"buttons_timer": 1, "since_goal": 1}
         asked = scene.config.observe_privileged
         chosen = tuple(sizes) if isinstance(asked, bool) else asked
-        for name in chosen:
-            if name not in sizes:
-                raise ConfigError(
-                    f"'observe_privileged': there is no component '{name}'."
-                    f"{did_you_mean(name, sizes)} Here there are {', '.join(sizes)}."
-                )
+        for name in (name for name in chosen if name not in sizes):
+            raise ConfigError(
+                f"'observe_privileged': there is no component '{name}'."
+                f"{did_you_mean(name, sizes)} Here there are {', '.join(sizes)}."
+            )
         self.columns = add_columns({}, {name: n for name, n in sizes.items() if name in chosen})
         is_kept = [name in chosen for name, size in sizes.items() for _ in range(size)]
         self._kept = torch.tensor(is_kept, device=world.com.device).nonzero().squeeze(1)

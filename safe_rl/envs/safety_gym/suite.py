@@ -82,8 +82,8 @@ _TASKS: dict[str, tuple[Values, tuple[Values, Values, Values]]] = {
 
 # Keys that differ from their defaults. A robot's own (the Car's smaller box) override the task's.
 SUITE: dict[str, Values] = {
-    f"{robot}{task}{level}": {**_COMMON, **shared, **levels[level], **own}
-    for robot, own in _ROBOTS.items()
+    f"{robot}{task}{level}": {**_COMMON, **shared, **levels[level], **keys}
+    for robot, keys in _ROBOTS.items()
     for task, (shared, levels) in _TASKS.items()
     for level in range(3)
 }
@@ -115,8 +115,8 @@ _NO_TARGETS: Values = {
 }
 
 _DEBUG_SUITE = {
-    f"{robot}{task}": {**_COMMON, **_NO_TARGETS, **values, **own}
-    for robot, own in _ROBOTS.items()
+    f"{robot}{task}": {**_COMMON, **_NO_TARGETS, **values, **keys}
+    for robot, keys in _ROBOTS.items()
     for task, values in (_DEBUG | _BOUNDED).items()
 }
 
@@ -203,7 +203,7 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
     for name, needed in _NEEDED.items():
         if getattr(config, name) and not getattr(config, needed):
             warnings.warn(f"'{name}' has no effect: set '{needed}' too.", stacklevel=2)
-    keys = config.to_dict()
+    keys = vars(config)
     for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
         pinned, number = len(keys.get(f"{kind}_locations", ())), keys.get(f"{kind}_num", 1)
         if pinned > number:

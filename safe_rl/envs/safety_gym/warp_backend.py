@@ -73,11 +73,11 @@ def most_contacts(config: SafetyGymConfig, env_class: Any) -> tuple[int, int]:
     env._begin(torch.ones(TRIAL_WORLDS, dtype=torch.bool))
     generator = torch.Generator().manual_seed(0)
     counts = [env._physics.outputs[name] for name in ("ncon", "nefc")]
-    found = [int(count.max()) for count in counts]
+    highest = [int(count.max()) for count in counts]
     for _ in range(TRIAL_STEPS):
         env._advance(2 * torch.rand(env.action_spec.shape, generator=generator) - 1)
-        found = [max(most, int(count.max())) for most, count in zip(found, counts, strict=True)]
-    return found[0], found[1]
+        highest = [max(most, int(count.max())) for most, count in zip(highest, counts, strict=True)]
+    return highest[0], highest[1]
 
 
 def _power_of_two(number: float) -> int:

@@ -107,9 +107,9 @@ def make_torchrl(
             f"env.id={config['id']} must make an environment [N] or a single one, got {shown}."
         )
     length = StepCounter(max_steps=config["num_steps"], step_count_key=_STEP)
-    made = TorchRLEnv(env.to(torch.device(device)), config, length)
-    made.set_seed(int(torch.randint(2**31, ())) if seed is None else spread_seed(seed))
-    return made
+    batch = TorchRLEnv(env.to(torch.device(device)), config, length)
+    batch.set_seed(int(torch.randint(2**31, ())) if seed is None else spread_seed(seed))
+    return batch
 
 
 def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
@@ -122,8 +122,8 @@ def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
                 f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
             )
         entries = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
-        found = [str(key) for key in entries if is_cost(key)]
-        return found if config["cost_keys"] is None else list(config["cost_keys"]), steps
+        cost_keys = [str(key) for key in entries if is_cost(key)]
+        return cost_keys if config["cost_keys"] is None else list(config["cost_keys"]), steps
     finally:
         env.close(raise_if_closed=False)
 
@@ -163,9 +163,9 @@ def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -
     if kwargs.get("from_pixels"):
         load_backend()
     if "." in name:
-        made: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
+        make: MakeEnv = partial(locate(name, key="env.id"), **kwargs)
     elif name in TORCHRL_CLASSES:
-        made = partial(getattr(torchrl.envs, name), **{**TORCHRL_CLASSES[name], **kwargs})
+        make = partial(getattr(torchrl.envs, name), **{**TORCHRL_CLASSES[name], **kwargs})
     else:
         raise ConfigError(
             f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
@@ -174,15 +174,15 @@ def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -
             "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
         )
     try:
-        return make_some(made)
+        return make_some(make)
     except _FAILURES as error:
         raise ConfigError(f"env.id={name}: {type(error).__name__}: {error}") from error
 
 
 def _one(make: MakeEnv) -> EnvBase:
     # a metaclass may hide the signature of a class
-    made = make.func.__init__ if inspect.isclass(make.func) else make.func
-    return make(num_envs=1) if "num_envs" in inspect.signature(made).parameters else make()
+    builder = make.func.__init__ if inspect.isclass(make.func) else make.func
+    return make(num_envs=1) if "num_envs" in inspect.signature(builder).parameters else make()
 
 
 def _batch(make: MakeEnv, num_envs: int) -> EnvBase:

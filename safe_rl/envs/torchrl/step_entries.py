@@ -71,7 +71,7 @@ class StepCosts(Transform):
 
     def _costs(self, step: TensorDictBase) -> dict[str, Tensor]:
         """All costs [N, 1] of a step [N] by name."""
-        found = [(name.rpartition(".")[2], _entry(step, name)) for name in self._entries]
+        named_costs = [(name.rpartition(".")[2], _entry(step, name)) for name in self._entries]
         for name, kept in self._ranges.items():
             values = _entry(step, kept.entry).reshape(*step.batch_size, -1)
             if kept.column >= values.shape[-1]:
@@ -80,15 +80,15 @@ class StepCosts(Transform):
                     f"{values.shape[-1]} columns; the first is 0."
                 )
             value = values[..., kept.column]
-            found.append((name, (value < kept.low) | (value > kept.high)))
+            named_costs.append((name, (value < kept.low) | (value > kept.high)))
         if self._function is not None:
             returned = self._function(step)
             named = returned if isinstance(returned, Mapping) else {COST: returned}
             if wrong := [name for name in named if not is_cost(name)]:
                 raise ConfigError(f"env.cost: costs are called cost_<kind>, not '{wrong[0]}'.")
-            found += named.items()
+            named_costs += named.items()
         costs: dict[str, Tensor] = {}
-        for name, cost in found:
+        for name, cost in named_costs:
             if name in costs:
                 raise ConfigError(f"There are two costs called '{name}'.")
             if not isinstance(cost, Tensor) or cost.numel() != step.batch_size.numel():

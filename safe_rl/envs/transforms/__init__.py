@@ -6,7 +6,12 @@ from safe_rl.envs.transforms.environment import (
     TransformedConstrainedEnv,
     transform_env,
 )
-from safe_rl.envs.transforms.observation_transforms import ObservedCosts, PolicyMemory, SensorNoise
+from safe_rl.envs.transforms.observation_transforms import (
+    ObservedCosts,
+    PolicyMemory,
+    RecurrentState,
+    SensorNoise,
+)
 from safe_rl.envs.transforms.reward_transforms import EarlyTermination, Saute, Simmer
 
 __all__ = [
@@ -17,6 +22,7 @@ __all__ = [
     "EarlyTermination",
     "ObservedCosts",
     "PolicyMemory",
+    "RecurrentState",
     "Saute",
     "SensorNoise",
     "Simmer",

@@ -183,8 +183,8 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
     @property
     def steps_per_decision(self) -> int:
         """Steps of the environment that one call of `step` takes."""
-        own = (transform.steps_per_decision for transform in self._ours.values())
-        return math.prod(own, start=self.base_env.steps_per_decision)
+        steps = (transform.steps_per_decision for transform in self._ours.values())
+        return math.prod(steps, start=self.base_env.steps_per_decision)
 
     def highest_cost(self, key: str) -> float:
         """Return the highest possible cost of an episode, with all transforms."""
@@ -289,32 +289,32 @@ def transform_env(
             "'transforms' must map names to transforms, such as {'slow': ActionFilter(…)}, got "
             f"{transforms!r}."
         )
-    made = {name: _transform(name, given) for name, given in transforms.items()}
-    for transform in made.values():
+    built = {name: _transform(name, given) for name, given in transforms.items()}
+    for transform in built.values():
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
-    repeating = _repeating(made)
-    if repeating and len(made) > 1:
+    repeating = _repeating(built)
+    if repeating and len(built) > 1:
         # The last transform takes several steps of an inner environment, which has all the others.
-        last = {repeating: made.pop(repeating)}
-        return TransformedConstrainedEnv(TransformedConstrainedEnv(env, made, seed), last, seed)
-    return TransformedConstrainedEnv(env, made, seed)
+        last = {repeating: built.pop(repeating)}
+        return TransformedConstrainedEnv(TransformedConstrainedEnv(env, built, seed), last, seed)
+    return TransformedConstrainedEnv(env, built, seed)
 
 
 def _repeating(transforms: Mapping[str, Transform]) -> str | None:
     """Name of the transform that takes several steps per decision, which must be the last."""
-    found = [
+    held = [
         name
         for name, transform in transforms.items()
         if isinstance(transform, ConstraintTransform) and transform.steps_per_decision != 1
     ]
-    if found and found != [list(transforms)[-1]]:
+    if held and held != [list(transforms)[-1]]:
         raise ValueError(
-            f"transforms: '{found[0]}' has to be the last one, because the others count steps of "
-            f"the environment: transforms=[{','.join([n for n in transforms if n != found[0]])},"
-            f"{found[0]}]."
+            f"transforms: '{held[0]}' has to be the last one, because the others count steps of "
+            f"the environment: transforms=[{','.join([n for n in transforms if n != held[0]])},"
+            f"{held[0]}]."
         )
-    return found[0] if found else None
+    return held[0] if held else None
 
 
 def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:

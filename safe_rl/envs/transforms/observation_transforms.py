@@ -150,7 +150,7 @@ class SensorNoise(ConstraintTransform):
 MEMORY, FIRST = "memory", "is_init"
 
 
-class PolicyMemory(ConstraintTransform):
+class RecurrentState(ConstraintTransform):
     """Copy the recurrent state ``("next", "memory")`` of a policy to its next step as ``memory``.
 
     The state is 0 at the start of an episode, where `is_init` is True. TorchRL's `TensorDictPrimer`
@@ -163,7 +163,7 @@ class PolicyMemory(ConstraintTransform):
     Examples:
         >>> from torchrl.envs import TransformedEnv
         >>> from safe_rl.envs import SafetyGymEnv
-        >>> env = TransformedEnv(SafetyGymEnv("PointGoal1", num_envs=2, seed=0), PolicyMemory(4))
+        >>> env = TransformedEnv(SafetyGymEnv("PointGoal1", num_envs=2, seed=0), RecurrentState(4))
         >>> state = env.reset()
         >>> state["memory"].shape, bool(state["is_init"].all())
         (torch.Size([2, 4]), True)
@@ -192,6 +192,9 @@ class PolicyMemory(ConstraintTransform):
         observation_spec[MEMORY] = Unbounded(shape=(*batch, self._size), device=device)
         observation_spec[FIRST] = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
         return observation_spec
+
+
+PolicyMemory = RecurrentState  # its name in the configurations of earlier runs
 
 
 LAST, TRACE = "last_costs", "cost_traces"

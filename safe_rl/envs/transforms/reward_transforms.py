@@ -159,8 +159,8 @@ class Saute(ConstraintTransform):
         self._rows = {**self._rows, BUDGET: left}
         reward = next_tensordict.get("reward")
         # the first transform that changes the reward keeps the environment's own
-        own = next_tensordict.get(self.return_key, reward)
-        next_tensordict.set(self.return_key, own)
+        task_reward = next_tensordict.get(self.return_key, reward)
+        next_tensordict.set(self.return_key, task_reward)
         if not self.evaluating:
             spent = (left <= _ROUNDING).any(-1, keepdim=True)
             next_tensordict.set("reward", reward.masked_fill(spent, self._unsafe_reward))

@@ -158,14 +158,14 @@ class VelocityConfig:
         if self.robot not in RUNNERS:
             hint = did_you_mean(str(self.robot), RUNNERS)
             raise ConfigError(f"'robot' must be one of {list(RUNNERS)}, got {self.robot!r}.{hint}")
-        own = RUNNERS[self.robot].defaults
+        defaults = RUNNERS[self.robot].defaults
         for row in fields(self)[1:]:
             value = getattr(self, row.name)
-            if row.default is None and row.name not in own:
+            if row.default is None and row.name not in defaults:
                 if value is not None:
                     raise ConfigError(f"Robot '{self.robot}' has no key '{row.name}'.")
                 continue
-            value = own.get(row.name) if value is None else value
+            value = defaults.get(row.name) if value is None else value
             vars(self)[row.name] = checked(row.name, ANNOTATIONS[row.name], value)
 
     @classmethod
