@@ -3,6 +3,7 @@
 from safe_rl.models.build_networks import build_networks
 from safe_rl.models.collecting_policies import (
     BehaviourPolicy,
+    ColouredNoise,
     ExploringPolicy,
     HeldActions,
     make_behaviour,
@@ -18,6 +19,7 @@ from safe_rl.models.replay_networks import (
 
 __all__ = [
     "BehaviourPolicy",
+    "ColouredNoise",
     "EnsembleMLP",
     "ExploringPolicy",
     "HeldActions",

@@ -92,6 +92,7 @@ _SILENT: dict[str, Hashable] = {
     "env.physics": "cpu",
     "env.physics_buffers": 2.0,
     "env.observe_privileged": False,
+    "exploration.colour": 0.0,
     "loss.cost_gamma": None,
     "model.critic_observes": ("observation",),
 }
