@@ -1,6 +1,7 @@
 """Policies of any distribution: KL, entropy and Fisher products against torch and differences."""
 
 import functools
+import math
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, set_composite_lp_aggregate
 from torch import nn
 from torch.distributions import Categorical, Independent, kl_divergence
-from torchrl.modules import MaskedCategorical, ProbabilisticActor
+from torchrl.modules import MaskedCategorical, ProbabilisticActor, TanhNormal
 from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
@@ -301,3 +302,11 @@ def test_choices_that_are_masked_leave_the_gradient_of_a_divergence_a_number(kin
         return losses["loss_objective"] + losses["loss_entropy"]
 
     assert_gradients_are_differences(total, actor)
+
+
+def test_the_entropy_of_a_saturated_policy_is_that_of_its_normal_and_the_slope_of_tanh():
+    """Far out log tanh'(x) is 2 log 2 − 2 |x|; actions there are rounded to the bound."""
+    normal = torch.full((50_000, 1), 20.0), torch.full((50_000, 1), 0.5)
+    squashed = TanhNormal(*normal, low=-1.0, high=1.0, event_dims=1)
+    expected = Independent(torch.distributions.Normal(*normal), 1).entropy() + 2 * math.log(2) - 40
+    torch.testing.assert_close(entropy(squashed).mean(), expected.mean(), atol=0.05, rtol=0)
