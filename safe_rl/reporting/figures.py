@@ -230,21 +230,3 @@ def _draw_values(
     axis.set_xlim(-0.6, len(values) - 0.4)
     set_grid(axis)
     axis.grid(visible=False, axis="x")
-
-
-def save_panels(figure: Figure, path: Path, formats: Iterable[str]) -> None:
-    """Write every panel of a figure to a file of its own, and the legend, if it has one.
-
-    Args:
-        figure: The figure.
-        path: Stem of the files: ``curves`` becomes ``curves_1.pdf``, ``curves_legend.pdf``.
-        formats: Suffixes of the files.
-    """
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw(renderer)
-    parts: dict[str, Any] = {f"{n}": axis for n, axis in enumerate(figure.axes, 1) if axis.axison}
-    parts |= dict(zip(["legend"], figure.legends, strict=False))
-    for name, part in parts.items():
-        box = part.get_tightbbox(renderer).transformed(figure.dpi_scale_trans.inverted())
-        for form in formats:
-            save_figure(figure, path.with_name(f"{path.name}_{name}.{form}"), box.padded(0.04))

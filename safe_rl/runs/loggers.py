@@ -1,7 +1,7 @@
-"""Loggers that continue an interrupted run.
+"""TorchRL's loggers, which here continue an interrupted run.
 
-Each is derived from TorchRL's, keeps its files or the id of its run in the folder ``log_dir``, and
-is chosen by ``logger=`` from ``conf/logger``.
+Each keeps its files or the id of its run in the folder ``log_dir``. Values that are logged again
+after an interruption are the same as before.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from tensorboard.plugins.hparams.summary_v2 import hparams_pb
 from torchrl.record.loggers.mlflow import MLFlowLogger
 from torchrl.record.loggers.tensorboard import TensorboardLogger as TorchRLTensorboardLogger
 from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
@@ -23,21 +21,8 @@ from safe_rl.files import read_text, replace_text
 from safe_rl.runs.run import Run
 
 
-class ResumableLogger:
-    """Methods that a run calls besides ``log_scalar``: a second base class of loggers."""
-
-    def continue_from(self, step: int) -> None:
-        """Discard what was logged after a step, unless logging it again replaces it."""
-
-    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
-        """Log the settings that the user has given, by name."""
-
-    def close(self) -> None:
-        """Write what is buffered and end the logger's run."""
-
-
 @checked
-class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
+class TensorboardLogger(TorchRLTensorboardLogger):
     """Event files for TensorBoard.
 
     Args:
@@ -53,33 +38,17 @@ class TensorboardLogger(TorchRLTensorboardLogger, ResumableLogger):
             raise ValueError(f"logger.exp_name={exp_name}: it names a folder in that of the run.")
         super().__init__(exp_name, log_dir)
 
-    def continue_from(self, step: int) -> None:
-        """Let TensorBoard discard what was logged after a step."""
-        writer = self.experiment._get_file_writer()
-        event = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
-        writer.add_event(event, step=step + 1)
-
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
-        """Write the settings by which TensorBoard's page HParams compares runs.
+        """Log no settings: TorchRL's method would make another run of TensorBoard for them."""
 
-        ``SummaryWriter.add_hparams`` would make another folder, and a list of columns; TensorBoard
-        then shows the columns of the first run only. Without a list it shows those of all runs.
-
-        Args:
-            cfg: Name -> number, text or boolean.
-        """
-        self.experiment._get_file_writer().add_summary(hparams_pb(dict(cfg)))
-
-    def close(self) -> None:
+    def close(self, timeout: float | None = None) -> None:
         """Write what is buffered."""
         self.experiment.close()
 
 
 @checked
-class MLflowLogger(MLFlowLogger, ResumableLogger):
+class MLflowLogger(MLFlowLogger):
     """A run of an MLflow experiment; a continued run uses the same MLflow run.
-
-    Metrics that are logged again after an interruption have the same values as before.
 
     Args:
         exp_name: Name of the experiment.
@@ -108,13 +77,13 @@ class MLflowLogger(MLFlowLogger, ResumableLogger):
         replace_text(path, run.info.run_id)
         return run
 
-    def close(self) -> None:
+    def close(self, timeout: float | None = None) -> None:
         """End the MLflow run, so that this process can begin another one."""
         self._mlflow.end_run()
 
 
 @checked
-class WandbLogger(TorchRLWandbLogger, ResumableLogger):
+class WandbLogger(TorchRLWandbLogger):
     """A run of Weights & Biases; a continued run uses the same W&B run.
 
     Args:
@@ -141,6 +110,6 @@ class WandbLogger(TorchRLWandbLogger, ResumableLogger):
             exp_name, offline=offline, project=project, log_dir=log_dir, id=run_id, **kwargs
         )
 
-    def close(self) -> None:
+    def close(self, timeout: float | None = None) -> None:
         """End the run, so that this process can begin another one."""
         self.experiment.finish()

@@ -19,7 +19,6 @@ from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings
-from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.run import Run, measure_of
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.trust import instantiate
@@ -86,11 +85,8 @@ class RunWriter:
                 opened.callback(self._logger.close)
             table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             self._table = opened.enter_context(table)
-            if self._logger is not None:
-                if epoch is not None:
-                    self._logger.continue_from(steps)
-                if not epoch:
-                    self._logger.log_hparams(given_settings(self.directory, self._config))
+            if self._logger is not None and not epoch:
+                self._logger.log_hparams(given_settings(self.directory, self._config))
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch
@@ -98,7 +94,6 @@ class RunWriter:
             opened.callback(self._bar.close)
             yield
             self._save_config()
-            self._log_final()
 
     def _make_logger(self) -> Any:
         try:
@@ -107,11 +102,11 @@ class RunWriter:
             raise
         except Exception as error:  # those of the services have types of their own
             raise SettingError(f"logger: {' '.join(str(error).split())}") from error
-        for name in ("log_scalar", "continue_from", "log_hparams", "close"):
+        for name in ("log_scalar", "log_hparams", "close"):
             if logger is not None and not callable(getattr(logger, name, None)):
                 raise SettingError(
                     f"logger._target_={self._config.logger._target_}: it has no '{name}'. Derive a "
-                    "logger of yours from safe_rl.runs.loggers.ResumableLogger."
+                    "logger of yours from torchrl.record.loggers.Logger."
                 )
         return logger
 
@@ -122,18 +117,6 @@ class RunWriter:
                 OmegaConf.save(self._config, unfinished, resolve=True)
             note_code(self.run.code_file, self._steps_before)
             self._is_config_saved = True
-
-    def _log_final(self) -> None:
-        """Write the final figures to the logger, which compares runs by them."""
-        if self._logger is None or not self.run.num_rows:
-            return
-        table = read_table(self.run.table_file)
-        figures = final_figures(table, list(self._cost_limits))
-        for name in ("episode_return", *(f"episode_{key}" for key in self._cost_limits)):
-            if not math.isnan(figures[name]):
-                self._logger.log_scalar(
-                    f"Final/{name}", figures[name], step=int(table["steps"][-1])
-                )
 
     def add(self, row: Mapping[str, float]) -> None:
         """Write an epoch to the table and the logger, and show it."""

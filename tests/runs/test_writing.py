@@ -6,9 +6,6 @@ import pytest
 from omegaconf import OmegaConf
 from run_configs import compose_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tensorboard.plugins.base_plugin import TBContext
-from tensorboard.plugins.hparams import metadata
-from tensorboard.plugins.hparams.backend_context import Context
 
 from safe_rl.runs.outcome import final_figures
 from safe_rl.runs.run import Run
@@ -91,41 +88,6 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     assert "λ=0.5" in bar
     assert "2.00k/2.00k" in bar
     assert "nan" not in bar
-
-
-def test_tensorboard_compares_runs_by_what_was_set(tmp_path):
-    lines = (
-        ["env=PointMass", "algo=cpo", "limits.margin=0.02", "seed=3", "num_threads=1"],
-        ["env=PointMass", "cost_limits={cost: 5}", "frames=1e6", "+note=it"],
-    )
-    starts, finals = {}, []
-    for number, overrides in enumerate(lines):
-        config = compose_config(*overrides)
-        writer = RunWriter(Run(tmp_path / str(number)), config, {"cost": 25.0}, 1000)
-        writer.run.notes_folder.mkdir(parents=True)
-        OmegaConf.save(overrides, writer.run.overrides_file)
-        with writer.writing():
-            for epoch in range(1, 8):  # the final figures are means of the last five
-                writer.add(row(epoch, number + epoch, 10.0 * epoch))
-        events = EventAccumulator(str(writer.directory / "tensorboard")).Reload()
-        starts[str(number)] = events.PluginTagToContent(metadata.PLUGIN_NAME)
-        finals += [events.Scalars(f"Final/episode_{name}")[-1].value for name in ("return", "cost")]
-    assert finals == [5.0, 50.0, 6.0, 50.0]
-    given = [
-        metadata.parse_session_start_info_plugin_data(kept[metadata.SESSION_START_INFO_TAG]).hparams
-        for kept in starts.values()
-    ]
-    assert [
-        {name: value.number_value or value.string_value for name, value in one.items()}
-        for one in given
-    ] == [
-        {"env": "PointMass", "algo": "cpo", "seed": 3.0, "limits.margin": 0.02},
-        {"env": "PointMass", "algo": "ppo_lagrangian", "seed": "", "frames": 1e6,
-         "cost_limits": "{'cost': 5}", "note": "it"},
-    ]  # fmt: skip
-    # the columns are those of all runs, not of the first one
-    page = Context(TBContext()).experiment_from_metadata(None, "", False, starts, [])
-    assert {info.name for info in page.hparam_infos} == {*given[0], *given[1]}
 
 
 def test_a_risk_measure_is_what_is_held_against_the_limit(tmp_path, capsys):
