@@ -25,8 +25,8 @@ from safe_rl.cli.composing import check_risk, name_choices
 from safe_rl.cli.config import check_settings
 from safe_rl.cli.user_code import import_modules
 from safe_rl.files import replace_text
-from safe_rl.runs.display import LINE_SECONDS
 from safe_rl.runs.folder import RunInUseError
+from safe_rl.runs.outcome import LINE_SECONDS
 from safe_rl.runs.run import Run
 
 _GRACE = 30.0

@@ -10,14 +10,12 @@ from __future__ import annotations
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from safe_rl import trust
-
-_imported: list[str] = []
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -67,14 +65,6 @@ def import_modules(modules: str | Sequence[str] | None) -> None:
                 f"{loaded_from}. Rename yours."
             )
         trust.allow(name)
-        where = module if name == module else str(path.resolve())
-        if where not in _imported:
-            _imported.append(where)
-
-
-def imported() -> list[str]:
-    """The modules that this process has imported, for other processes to import."""
-    return list(_imported)
 
 
 def _import(name: str, given: str) -> str:
@@ -97,12 +87,6 @@ def _import(name: str, given: str) -> str:
 def _is_inner(file: str) -> bool:
     """Whether code is of this package or of Python's import."""
     return file.startswith(str(Path(trust.__file__).parent)) or "importlib" in file
-
-
-def make_after_imports(modules: Sequence[str], make: Callable[..., Any], **options: Any) -> Any:
-    """Import the user's modules in a worker process, then call ``make`` with the options."""
-    import_modules(modules)
-    return make(**options)
 
 
 def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
-from safe_rl.evaluation.measuring import Trial
+from safe_rl.evaluation.measuring import PolicyEvaluation
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
@@ -76,16 +76,16 @@ def certify(
     plain = EvaluationOptions(
         device=device, num_threads=num_threads, deterministic=options.deterministic
     )
-    trials = [Trial(config, path, plain, make_env) for path in candidates]
+    evaluations = [PolicyEvaluation(config, path, plain, make_env) for path in candidates]
     asked = ("most_over", "bound", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in asked})
     number, error = _spend(run, options, candidates)
     claim = replace(claim, level=1 - error)
-    order, claims = _ranked(trials, claim, options, progress)
+    order, claims = _ranked(evaluations, claim, options, progress)
     seed = _TEST + (number - 1) * _NEXT_TEST
 
     def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
-        for _, (episodes,) in _run([trials[candidate]], seed, options.episodes, progress):
+        for _, (episodes,) in _run([evaluations[candidate]], seed, options.episodes, progress):
             yield _costs(episodes)
 
     verdict = first_certified(order, collect, claims, options.tests, options.episodes)
@@ -93,8 +93,8 @@ def certify(
     certificate = Certificate(None, math.nan, verdict, options, test=number, fewest=fewest)
     if (chosen := verdict.certified) is not None:
         # episodes of the test have decided when it ended: it ends when costs happen to be low
-        batch = _BATCH_OF_WARP if _has_warp(trials[chosen]) else _BATCH
-        _, (after,) = next(_run([trials[chosen]], seed - _TEST + _AFTER, batch, progress))
+        batch = _BATCH_OF_WARP if _has_warp(evaluations[chosen]) else _BATCH
+        _, (after,) = next(_run([evaluations[chosen]], seed - _TEST + _AFTER, batch, progress))
         statements = claims[chosen].statements(_costs(after))
         certificate = replace(
             certificate,
@@ -130,25 +130,28 @@ def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) ->
 
 
 def _ranked(
-    trials: Sequence[Trial], claim: Claim, options: CertificateOptions, progress: bool
+    evaluations: Sequence[PolicyEvaluation],
+    claim: Claim,
+    options: CertificateOptions,
+    progress: bool,
 ) -> tuple[list[int], list[Claim]]:
     """Order candidates for the tests; returns their numbers, and the claim about each of them.
 
     In every round the worse half of the candidates is given up (successive halving), as long as
     more are left than can be tested. A simulation that all of them share has one round.
     """
-    together = _has_warp(trials[0])
+    together = _has_warp(evaluations[0])
     rounds = [options.ranking]
-    if not together and options.ranking >= 4 / min(_ROUNDS) and len(trials) > options.tests:
+    if not together and options.ranking >= 4 / min(_ROUNDS) and len(evaluations) > options.tests:
         rounds = [int(share * options.ranking) for share in _ROUNDS]
         rounds[-1] = options.ranking - sum(rounds[:-1])
-    episodes_of: list[list[Episodes]] = [[] for _ in trials]
-    left, given_up = list(range(len(trials))), list[int]()
+    episodes_of: list[list[Episodes]] = [[] for _ in evaluations]
+    left, given_up = list(range(len(evaluations))), list[int]()
     for part, number in enumerate(rounds):
         seed = _RANKING + part * _NEXT_BATCH
         for group in [left] if together else [[candidate] for candidate in left]:
-            group_trials = [trials[candidate] for candidate in group]
-            highest, episodes = next(_run(group_trials, seed, number, progress))
+            group_evaluations = [evaluations[candidate] for candidate in group]
+            highest, episodes = next(_run(group_evaluations, seed, number, progress))
             for candidate, batch in zip(group, episodes, strict=True):
                 episodes_of[candidate].append(batch)
         claim = replace(claim, highest=highest)
@@ -180,41 +183,41 @@ def _candidates(run: Run) -> list[Path]:
     return [found[name] for name in sorted(found)] or run.checkpoints("certified")
 
 
-def _has_warp(trial: Trial) -> bool:
-    return trial.node.get("physics") == "warp"
+def _has_warp(evaluation: PolicyEvaluation) -> bool:
+    return evaluation.node.get("physics") == "warp"
 
 
 def _run(
-    trials: list[Trial], seed_offset: int, number: int, progress: bool
+    evaluations: list[PolicyEvaluation], seed_offset: int, number: int, progress: bool
 ) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
-    """Batches of episodes with seeds that neither training nor another use has, per trial.
+    """Batches of episodes with seeds that neither training nor another use has, per checkpoint.
 
     A round of the ranking is one batch. In a batch of a test every environment has one episode, so
     short episodes do not count before long ones. Every batch has new instances of the environment:
     episodes of one instance are not independent if it draws constants when it is made. Only a fixed
-    layout, which is such a constant, is kept. Trials of one call share one simulation; those of
-    several calls have the same layouts. With a batch come the highest possible costs of an episode.
+    layout, which is such a constant, is kept. Checkpoints of one call share one simulation; those
+    of several calls have the same layouts. Costs come with the highest possible ones of an episode.
     """
-    trial, together = trials[0], len(trials)
-    run_seed, is_fixed = trial.seed, has_fixed_layout(trial.node)  # if fixed, the seed of training
-    most = _BATCH_OF_WARP if _has_warp(trial) else _BATCH
+    evaluation, together = evaluations[0], len(evaluations)
+    run_seed, is_fixed = evaluation.seed, has_fixed_layout(evaluation.node)
+    most = _BATCH_OF_WARP if _has_warp(evaluation) else _BATCH
     batch = number if seed_offset < _TEST else min(number, most)
     worlds = batch if together > 1 else min(number, most)
-    keys = list(trial.config.cost_limits)
+    keys = list(evaluation.config.cost_limits)
     torch.manual_seed(run_seed + seed_offset)
     with ExitStack() as stack, tqdm(total=number, disable=None if progress else True) as bar:
         for part in range(math.ceil(number / batch)):
             if part == 0 or not is_fixed:
                 stack.close()
                 seed = run_seed if is_fixed else run_seed + seed_offset + part * _NEXT_BATCH
-                changed = replace(trial, options=replace(trial.options, seed=seed))
+                changed = replace(evaluation, options=replace(evaluation.options, seed=seed))
                 env = stack.enter_context(closing(changed.make(worlds * together)))
-                policy = _side_by_side([each.policy(env) for each in trials])
+                policy = _side_by_side([each.policy(env) for each in evaluations])
                 highest = {key: env.highest_cost(key) for key in keys}
             collected = collect_episodes(
-                env, policy, batch * together, keys, deterministic=trial.options.deterministic
+                env, policy, batch * together, keys, deterministic=evaluation.options.deterministic
             )
-            # sorted by environment, so those of a trial follow each other
+            # sorted by environment, so those of a checkpoint follow each other
             columns = [collected.returns, collected.lengths, *collected.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)
             yield (

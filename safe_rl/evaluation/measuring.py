@@ -57,14 +57,14 @@ class Evaluation:
             f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
             f"with {actions}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
             *format_estimates(self.estimates, facts["cost_limits"], facts["limited_measure"]),
-            *format_unjudged(facts["limits_without_cost"]),
+            *format_limits_without_cost(facts["limits_without_cost"]),
             *(f"wrote {path}" for path in self.files),
         ]
         return "\n".join(lines)
 
 
 @dataclass(frozen=True)
-class Trial:
+class PolicyEvaluation:
     """A run's policy in an environment, its own or a changed one.
 
     Attributes:
@@ -116,7 +116,7 @@ class Trial:
         risk = OmegaConf.select(self.config, "risk._target_") or "mean"
         limits = {key: float(limit) for key, limit in self.config.cost_limits.items()}
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
-            unjudged = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
+            without_cost = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
             limits |= check_cost_limits(options.cost_limits, env.cost_keys)
             policy = self.policy(env)  # before an earlier recording is removed: it may not fit
             recorder = None
@@ -139,7 +139,7 @@ class Trial:
             **asdict(options),
             "seed": self.seed,
             "cost_limits": limits,
-            "limits_without_cost": unjudged,
+            "limits_without_cost": without_cost,
             "limited_measure": risk.rpartition(".")[2],
         }
 
@@ -188,24 +188,24 @@ def evaluate(
     checkpoint = run.find_checkpoint(options.checkpoint)
     changed = config.copy()
     changed.env = override_env(config, options.env)
-    trial = Trial(changed, checkpoint, options, make_env)
+    evaluation = PolicyEvaluation(changed, checkpoint, options, make_env)
     # some environments draw pictures only if this key asks for it
-    drawing = {"render_mode": "rgb_array"} if "render_mode" in trial.node else {}
+    drawing = {"render_mode": "rgb_array"} if "render_mode" in evaluation.node else {}
     summary, table = (run.evaluation_file(options.name, kind) for kind in ("json", "csv"))
     films = [run.evaluation_file(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
     kept = [run.evaluation_file(options.name, "transitions")] if options.record else []
     check_places(directory, [summary, table, *films])
     for film in films:
-        with closing(trial.make(1, **drawing)) as single:
+        with closing(evaluation.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
-    episodes, facts = trial.run(progress=progress, record=kept[0] if kept else None)
-    reference = suite.reference(trial.node, but_for=_LAYOUTS)
+    episodes, facts = evaluation.run(progress=progress, record=kept[0] if kept else None)
+    reference = suite.reference(evaluation.node, but_for=_LAYOUTS)
     estimates = summarise(episodes, facts["cost_limits"], reference, options.cvar_alpha)
     known = shared_layouts(
         OmegaConf.to_container(config.env),  # type: ignore[arg-type]
-        trial.node,
-        same_seed=trial.seed == config.seed,
+        evaluation.node,
+        same_seed=evaluation.seed == config.seed,
     )
     facts = {"run": str(directory), "layouts_trained_on": known, **facts}
     parts = {name: estimate._asdict() for name, estimate in estimates.items()}
@@ -214,7 +214,7 @@ def evaluate(
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     replace_csv(table, [columns, *rows])
     for film in films:
-        trial.film(film, **drawing)
+        evaluation.film(film, **drawing)
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
 
 
@@ -284,7 +284,7 @@ def format_estimates(
     return lines
 
 
-def format_unjudged(limits: Mapping[str, float]) -> list[str]:
+def format_limits_without_cost(limits: Mapping[str, float]) -> list[str]:
     """A line for each limit of the run on a cost that its changed environment does not have."""
     return [
         f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"

@@ -11,7 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.loading import check_env_keys, override_env
-from safe_rl.evaluation.measuring import Trial, check_places, format_unjudged, summarise
+from safe_rl.evaluation.measuring import (
+    PolicyEvaluation,
+    check_places,
+    format_limits_without_cost,
+    summarise,
+)
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
 from safe_rl.naming import did_you_mean
@@ -182,7 +187,7 @@ class Varied:
     Attributes:
         rows: First the run's own environment, then every variation.
         left_out: Variations that this environment cannot have, and why.
-        facts: What was evaluated in the run's own environment, and how; see `Trial.run`.
+        facts: What was evaluated in the run's own environment, and how.
         file: The table.
     """
 
@@ -213,7 +218,7 @@ class Varied:
         for line in lines:
             cells = (cell.ljust(width) for cell, width in zip(line, widths, strict=True))
             text.append("  ".join(cells).rstrip())
-        text += format_unjudged(facts["limits_without_cost"])
+        text += format_limits_without_cost(facts["limits_without_cost"])
         reasons: dict[str, list[str]] = {}
         for variation, reason in self.left_out:
             reasons.setdefault(reason, []).append(str(variation))
@@ -244,7 +249,7 @@ def evaluate_variations(
     check_places(directory, [file, picture])
     for variation in variations:  # wrong keys and layouts are found before the first episode
         if not variation.may_lack and (changed := varied(config, variation)) is not None:
-            env = Trial(changed, checkpoint, options, make_env).make(num_envs=1)
+            env = PolicyEvaluation(changed, checkpoint, options, make_env).make(num_envs=1)
             env.reset()
             env.close()
     rows: list[VariedRow] = []
@@ -258,15 +263,15 @@ def evaluate_variations(
                 continue
             if progress:
                 print(f"… {variation}", flush=True)
-            trial = Trial(changed, checkpoint, options, make_env)
-            episodes, trial_facts = trial.run()
+            evaluation = PolicyEvaluation(changed, checkpoint, options, make_env)
+            episodes, row_facts = evaluation.run()
         except ValueError as error:
             if not variation.may_lack:
                 raise
             left_out.append((variation, str(error)))
             continue
-        facts = facts or trial_facts
-        estimates = summarise(episodes, trial_facts["cost_limits"], None, options.cvar_alpha)
+        facts = facts or row_facts
+        estimates = summarise(episodes, row_facts["cost_limits"], None, options.cvar_alpha)
         rows.append(VariedRow(variation, estimates))
     _write(file, rows)
     return Varied(tuple(rows), tuple(left_out), facts, file)

@@ -16,9 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.checks import is_number
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
-from safe_rl.runs.display import outcome_line
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
-from safe_rl.runs.outcome import final_figures, measured
+from safe_rl.runs.outcome import final_figures, measured, outcome_line
 from safe_rl.runs.table import MOST_BYTES, read_table
 
 KINDS = ("last", "best", "certified")

@@ -16,9 +16,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.checks import SettingError
 from safe_rl.files import read_json, replace_json, replacing
-from safe_rl.runs.display import ProgressBar, outcome_line
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings
+from safe_rl.runs.outcome import ProgressBar, outcome_line
 from safe_rl.runs.run import Run, measure_of
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.trust import instantiate

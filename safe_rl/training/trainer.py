@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from signal import Signals
 from typing import Any
 
@@ -20,7 +20,7 @@ from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.writing import RunWriter
-from safe_rl.training.candidates import Candidates, Judged, epochs_until_judged
+from safe_rl.training.checkpoint_selection import CheckpointSelection, epochs_until_evaluated
 from safe_rl.training.state import (
     EnvSnapshot,
     Progress,
@@ -95,7 +95,7 @@ class Trainer:
             self.accounting.ignore_open_episodes()
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
-        self._candidates = self._find_candidates(config.checkpoint.get("best_over", 1), cost_limits)
+        self._selection = self._make_selection(config.checkpoint.get("best_over", 1), cost_limits)
         self._checkpoints = self._open_checkpoints(config)
 
     def _open_checkpoints(self, config: DictConfig) -> CheckpointStore:
@@ -109,19 +109,19 @@ class Trainer:
             interface=self.interface,
         )
 
-    def _find_candidates(self, over: int, limits: Mapping[str, float]) -> Candidates:
+    def _make_selection(self, over: int, limits: Mapping[str, float]) -> CheckpointSelection:
         steps = self._frames_per_batch / self._env.batch_size.numel()
-        return Candidates(
+        return CheckpointSelection(
             {name: part for name, part in self._parts().items() if name not in _FOR_RESUMING},
             limits,
             over=over,
-            delay=lambda length: epochs_until_judged(over, length, steps),
+            delay=lambda length: epochs_until_evaluated(over, length, steps),
             longest=self.episode_length,
         )
 
     def components(self) -> dict[str, Stateful]:
         """The parts of a checkpoint by name."""
-        return {**self._parts(), "candidates": self._candidates}
+        return {**self._parts(), "candidates": self._selection}
 
     def _parts(self) -> dict[str, Stateful]:
         parts: dict[str, Stateful] = {
@@ -215,13 +215,14 @@ class Trainer:
             if self._recording is not None:
                 # batches after the checkpoint are removed, as rows of the table are
                 self._recording.begin(self.progress.epoch)
-            self._candidates.continue_after(self.writer.rows())
-            # if the run was shorter before, these were judged by fewer epochs at its end
-            self._checkpoints.forget_best(one["steps"] for one in self._candidates.waiting)
+            self._selection.continue_after(self.writer.rows())
+            # if the run was shorter before, these were evaluated by fewer epochs at its end
+            self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
                 self.writer.add(row)
-                self._keep(self._candidates.add(row))
+                for policy in self._selection.add(row):
+                    self._checkpoints.save_best(**policy)
                 answers = [callback(row) for callback in self.callbacks]
                 # also the False of NumPy
                 if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
@@ -234,7 +235,8 @@ class Trainer:
             self.stopped_by = stop.received
             if self.is_finished:
                 # before the last checkpoint is written, which marks the run as finished
-                self._keep(self._candidates.judge_all())
+                for policy in self._selection.evaluate_all():
+                    self._checkpoints.save_best(**policy)
             self._save()
 
     def batches(self) -> Iterator[TensorDictBase]:
@@ -278,9 +280,3 @@ class Trainer:
     def _save(self) -> None:
         self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
         self.writer.draw_curves()
-
-    def _keep(self, judged: Iterable[Judged]) -> None:
-        """Save checkpoints of the judged policies that are among the best so far."""
-        for policy in judged:
-            steps, score, facts, states = policy
-            self._checkpoints.save_best(steps, score, facts, states=states)

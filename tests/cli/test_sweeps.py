@@ -17,8 +17,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import Summary, run_in_sweep
 from safe_rl.runs.checkpoints import read_facts
-from safe_rl.runs.display import LINE_SECONDS, ProgressBar
-from safe_rl.runs.outcome import final_figures
+from safe_rl.runs.outcome import LINE_SECONDS, ProgressBar, final_figures
 from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import read_table
 

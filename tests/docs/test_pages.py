@@ -16,7 +16,6 @@ from commands import composed
 from registrations import undone
 
 from safe_rl import trust
-from safe_rl.cli import user_code
 from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.options import read_options
 from safe_rl.cli.report import ReportOptions
@@ -81,7 +80,6 @@ def workplace(tmp_path, monkeypatch):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.setattr(user_code, "_imported", [])
     monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     with undone():
         yield tmp_path

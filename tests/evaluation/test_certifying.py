@@ -17,7 +17,7 @@ from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify, certifying
 from safe_rl.evaluation.certifying import _RANKING, _TEST, _run, _write
 from safe_rl.evaluation.episodes import Episodes
-from safe_rl.evaluation.measuring import Trial
+from safe_rl.evaluation.measuring import PolicyEvaluation
 from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.reporting.tables import read_certificate
@@ -158,11 +158,13 @@ def test_every_batch_of_a_test_has_new_instances_of_the_environment(monkeypatch)
 
     config = point_mass_config("cost_limits={cost: 19}")
     options = EvaluationOptions(device="cpu", num_threads=1)
-    trial = Trial(config, Path("0"), options, make)
-    trial.__dict__["policy"] = lambda env: (
+    evaluation = PolicyEvaluation(config, Path("0"), options, make)
+    evaluation.__dict__["policy"] = lambda env: (
         lambda state: state.set("action", torch.zeros(len(state), 2))
     )
-    costs = torch.stack([found[0].costs["cost"] for _, found in _run([trial], _TEST, 2000, False)])
+    costs = torch.stack(
+        [found[0].costs["cost"] for _, found in _run([evaluation], _TEST, 2000, False)]
+    )
     assert costs.shape == (20, 100)
     # of rows that cost 20 in one batch, a tenth does in the next, and not all
     again = costs[1:][costs[:-1] > 0]
@@ -277,33 +279,35 @@ def test_the_ranking_gives_up_the_worse_half_in_every_round(monkeypatch):
     """Sixteen candidates; the higher their number, the more they cost, all above the limit."""
     used = dict.fromkeys(range(16), 0)
 
-    def run(trials, seed, number, progress):
-        (trial,) = trials
-        used[trial.number] += number
-        costs = 20.0 + trial.number + torch.rand(number) / 10
+    def run(evaluations, seed, number, progress):
+        (evaluation,) = evaluations
+        used[evaluation.number] += number
+        costs = 20.0 + evaluation.number + torch.rand(number) / 10
         yield {"cost": 100.0}, [Episodes(costs, costs, {"cost": costs})]
 
     monkeypatch.setattr(certifying, "_run", run)
-    trials = [SimpleNamespace(node={}, number=number) for number in used]
+    evaluations = [SimpleNamespace(node={}, number=number) for number in used]
     claim = Claim({"cost": 19.0})
-    order, claims = certifying._ranked(trials, claim, replace(OPTIONS, ranking=40), False)
+    order, claims = certifying._ranked(evaluations, claim, replace(OPTIONS, ranking=40), False)
     assert order == list(range(16))
     assert [used[number] for number in order] == [40] * 4 + [20] * 4 + [10] * 8
     assert {one.highest["cost"] for one in claims} == {100.0}
 
 
 def test_policies_that_share_a_simulation_get_their_own_episodes(monkeypatch):
-    def constant(trial, env):
-        action = float(trial.checkpoint.name)
+    def constant(evaluation, env):
+        action = float(evaluation.checkpoint.name)
         return lambda state: state.set("action", torch.full((len(state), 2), action))
 
-    monkeypatch.setattr(Trial, "policy", constant)
+    monkeypatch.setattr(PolicyEvaluation, "policy", constant)
     config = point_mass_config("cost_limits={cost: 19}", "+env.physics=warp")
     options = EvaluationOptions(device="cpu", num_threads=1)
-    trials = [Trial(config, Path(action), options, make_env) for action in ("-1", "0", "1")]
-    _, together = next(_run(trials, _RANKING, 9, progress=False))
-    for trial, found in zip(trials, together, strict=True):
-        _, (alone,) = next(_run([trial], _RANKING, 9, progress=False))
+    evaluations = [
+        PolicyEvaluation(config, Path(action), options, make_env) for action in ("-1", "0", "1")
+    ]
+    _, together = next(_run(evaluations, _RANKING, 9, progress=False))
+    for evaluation, found in zip(evaluations, together, strict=True):
+        _, (alone,) = next(_run([evaluation], _RANKING, 9, progress=False))
         assert found.costs["cost"].shape == (9,)
         assert found.returns.mean().item() == pytest.approx(alone.returns.mean().item(), rel=0.1)
     assert len({found.returns.mean().round(decimals=1).item() for found in together}) == 3

@@ -1,4 +1,4 @@
-"""Candidates for the best checkpoints: each policy is judged by its own episodes."""
+"""Selection of the best checkpoints: each policy is evaluated by its own episodes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from safe_rl.algorithms.algorithm_contract import Stateful
 from safe_rl.resumable import Resumable
@@ -16,7 +16,7 @@ from safe_rl.runs.outcome import feasible_return
 _LONGEST = 10
 
 
-def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int:
+def epochs_until_evaluated(over: int, length: float, steps_per_epoch: float) -> int:
     """Epochs from a policy's update until the finished episodes are, on average, its own.
 
     A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
@@ -24,32 +24,16 @@ def epochs_until_judged(over: int, length: float, steps_per_epoch: float) -> int
     Returns and costs are averaged over a number of epochs, `over`.
 
     Examples:
-        >>> epochs_until_judged(over=1, length=1000, steps_per_epoch=1000)
+        >>> epochs_until_evaluated(over=1, length=1000, steps_per_epoch=1000)
         1
-        >>> epochs_until_judged(over=3, length=1000, steps_per_epoch=200)
+        >>> epochs_until_evaluated(over=3, length=1000, steps_per_epoch=200)
         4
     """
     lag = length / steps_per_epoch / 2 if length > steps_per_epoch else 0.0
     return 1 + min(_LONGEST, int(lag) + over // 2)
 
 
-class Judged(NamedTuple):
-    """A policy that kept every limit: the arguments of `CheckpointStore.save_best`.
-
-    Attributes:
-        steps: Environment steps of the run when it was the current policy.
-        score: Its return.
-        facts: Facts about it for its checkpoint.
-        states: States of the parts of the run at that time, by name.
-    """
-
-    steps: int
-    score: float
-    facts: dict[str, Any]
-    states: dict[str, Any]
-
-
-class Candidates(Resumable):
+class CheckpointSelection(Resumable):
     """Policies that wait for the epochs in which their own episodes end.
 
     Args:
@@ -57,7 +41,7 @@ class Candidates(Resumable):
         limits: Cost key -> d, undiscounted cost per episode.
         over: Number of epochs over which returns and costs are averaged.
         delay: Function of the mean episode length. It returns how many epochs after its update a
-            policy is judged.
+            policy is evaluated.
         longest: Largest length of an episode, used as the mean length until an episode has ended.
 
     Attributes:
@@ -99,37 +83,40 @@ class Candidates(Resumable):
         for row in rows:
             self._take(row)
 
-    def add(self, row: Mapping[str, float]) -> list[Judged]:
-        """Add an epoch, and judge the waiting policy whose epochs are complete.
+    def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Add an epoch, and evaluate the waiting policy whose epochs are complete.
 
         Args:
             row: Of the run's table, by column.
 
         Returns:
-            The judged policy, if it kept every limit. If episodes have become shorter, several
-            are due, and only the latest is judged.
+            Keyword arguments of `CheckpointStore.save_best` for the policy, if it kept every limit.
+            If episodes have become shorter, several are due, and only the latest is evaluated.
         """
         self._take(row)
         states = {name: copy.deepcopy(part.state_dict()) for name, part in self._components.items()}
         self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
         due = len(self.waiting) - self._delay(self._length)
         passed = [self.waiting.pop(0) for _ in range(due)]
-        return self._judge(passed[-1]) if passed else []
+        return self._evaluate(passed[-1]) if passed else []
 
     def _take(self, row: Mapping[str, float]) -> None:
         self._latest.append(row)
         length = row.get("episode_length", math.nan)
         self._length = length if math.isfinite(length) else self._length
 
-    def judge_all(self) -> list[Judged]:
-        """Judge all waiting policies by the epochs so far, at the end of a run.
+    def evaluate_all(self) -> list[dict[str, Any]]:
+        """Evaluate all waiting policies by the epochs so far, at the end of a run.
 
-        They keep waiting, because a resumed run has later epochs to judge them by.
+        They keep waiting, because a resumed run has later epochs to evaluate them by.
         """
-        return [judged for policy in self.waiting for judged in self._judge(policy)]
+        return [evaluated for policy in self.waiting for evaluated in self._evaluate(policy)]
 
-    def _judge(self, policy: Mapping[str, Any]) -> list[Judged]:
+    def _evaluate(self, policy: Mapping[str, Any]) -> list[dict[str, Any]]:
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []
-        return [Judged(policy["steps"], score, {"epoch": policy["epoch"]}, policy["states"])]
+        facts = {"epoch": policy["epoch"]}
+        return [
+            {"steps": policy["steps"], "score": score, "facts": facts, "states": policy["states"]}
+        ]

@@ -1,4 +1,4 @@
-"""The best policies: judged by episodes whose policies are known by construction."""
+"""The best policies: evaluated by episodes whose policies are known by construction."""
 
 import functools
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from safe_rl.runs.outcome import keeps
-from safe_rl.training.candidates import Candidates, epochs_until_judged
+from safe_rl.training.checkpoint_selection import CheckpointSelection, epochs_until_evaluated
 
 EPISODE = 1000
 
@@ -44,25 +44,25 @@ def epochs(values, rows, steps):
         yield {"epoch": epoch, "steps": epoch * steps * rows, "episode_return": mean}
 
 
-def judge(values, rows, steps, over=3):
+def evaluate(values, rows, steps, over=3):
     """Scores by the number of the policy."""
     policy = Policy()
-    delay = functools.partial(epochs_until_judged, over, steps_per_epoch=steps)
-    candidates = Candidates({"policy": policy}, {}, over=over, delay=delay, longest=EPISODE)
-    judged = []
+    delay = functools.partial(epochs_until_evaluated, over, steps_per_epoch=steps)
+    selection = CheckpointSelection({"policy": policy}, {}, over=over, delay=delay, longest=EPISODE)
+    evaluated = []
     for row in epochs(values, rows, steps):
         # what collected this batch was policy epoch − 1; the update makes it the next one
         policy.number = row["epoch"]
-        judged += candidates.add(row)
-    return {int(one.states["policy"]["number"]): one.score for one in judged}
+        evaluated += selection.add(row)
+    return {int(one["states"]["policy"]["number"]): one["score"] for one in evaluated}
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(100, 200), (20, 1000), (50, 500), (100, 100)])
 def test_the_score_of_a_policy_is_that_of_the_episodes_around_it(rows, steps):
-    # a hill of returns: whoever is judged by episodes of earlier policies finds a later summit
+    # a hill of returns: whoever is evaluated by episodes of earlier policies finds a later summit
     summit = 24
     values = [-abs(number - summit) / 4 + 10.0 for number in range(48)]
-    scores = judge(values, rows, steps)
+    scores = evaluate(values, rows, steps)
     best = max(scores, key=scores.get)
     assert abs(best - summit) <= 1
     lag = EPISODE // steps
@@ -71,20 +71,20 @@ def test_the_score_of_a_policy_is_that_of_the_episodes_around_it(rows, steps):
 
 
 def test_a_single_epoch_of_whole_episodes_judges_the_policy_that_played_them():
-    scores = judge([float(number % 7) for number in range(20)], rows=1, steps=1000, over=1)
+    scores = evaluate([float(number % 7) for number in range(20)], rows=1, steps=1000, over=1)
     assert scores == pytest.approx({number: float(number % 7) for number in range(1, 20)})
 
 
 def test_limits_are_held_against_the_mean_of_the_epochs():
-    candidates = Candidates({}, {"cost": 25.0}, over=2, delay=lambda length: 1, longest=1)
+    selection = CheckpointSelection({}, {"cost": 25.0}, over=2, delay=lambda length: 1, longest=1)
     kept = []
     for epoch, cost in enumerate((20.0, 28.0, 30.0, 16.0, 10.0), 1):
         row = {"epoch": epoch, "steps": epoch, "episode_return": 1.0, "episode_cost": cost}
-        kept += [one.steps for one in candidates.add(row)]
+        kept += [one["steps"] for one in selection.add(row)]
     # means of 24, 29, 23, 13, of which each judges the policy of the epoch before
     assert kept == [1, 3, 4]
-    assert [one.steps for one in candidates.judge_all()] == [5]
-    assert [policy["steps"] for policy in candidates.waiting] == [5]
+    assert [one["steps"] for one in selection.evaluate_all()] == [5]
+    assert [policy["steps"] for policy in selection.waiting] == [5]
 
 
 @pytest.mark.parametrize(
@@ -97,39 +97,41 @@ def test_an_estimate_has_to_be_at_its_target_and_within_the_limit(estimate, targ
 
 
 def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
-    candidates = Candidates({}, {"cost": 25.0}, over=1, delay=lambda length: 1, longest=1)
+    selection = CheckpointSelection({}, {"cost": 25.0}, over=1, delay=lambda length: 1, longest=1)
     row = {"epoch": 1, "steps": 1, "episode_return": 1.0}
-    assert candidates.add(row | {"episode_cost": 20.0}) == []
-    assert [one.steps for one in candidates.judge_all()] == [1]
-    assert candidates.add(row | {"steps": 2, "episode_cost": 30.0}) == []
-    assert [policy["steps"] for policy in candidates.waiting] == [2]
+    assert selection.add(row | {"episode_cost": 20.0}) == []
+    assert [one["steps"] for one in selection.evaluate_all()] == [1]
+    assert selection.add(row | {"steps": 2, "episode_cost": 30.0}) == []
+    assert [policy["steps"] for policy in selection.waiting] == [2]
 
 
 def test_what_waits_is_a_copy_and_survives_a_checkpoint():
     network = torch.nn.Linear(1, 1)
     row = {"episode_return": 1.0}
-    first = Candidates({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
+    first = CheckpointSelection({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
     assert first.add({"epoch": 1, "steps": 1, **row}) == []
     before = network.weight.detach().clone()
     with torch.no_grad():
         network.weight.add_(1.0)
-    second = Candidates({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
+    second = CheckpointSelection(
+        {"network": network}, {}, over=1, delay=lambda length: 1, longest=1
+    )
     second.load_state_dict(first.state_dict())
-    (judged,) = second.add({"epoch": 2, "steps": 2, **row})
-    assert judged.steps == 1
-    assert torch.equal(judged.states["network"]["weight"], before)
+    (evaluated,) = second.add({"epoch": 2, "steps": 2, **row})
+    assert evaluated["steps"] == 1
+    assert torch.equal(evaluated["states"]["network"]["weight"], before)
 
 
 def test_of_short_episodes_nobody_waits_as_if_they_were_long():
-    delay = functools.partial(epochs_until_judged, 1, steps_per_epoch=200)
-    candidates = Candidates({}, {}, over=1, delay=delay, longest=1000)
-    judged = []
+    delay = functools.partial(epochs_until_evaluated, 1, steps_per_epoch=200)
+    selection = CheckpointSelection({}, {}, over=1, delay=delay, longest=1000)
+    evaluated = []
     for epoch, length in enumerate((float("nan"), 1000.0, 1000.0, 50.0, 50.0, float("nan")), 1):
         row = {"epoch": epoch, "steps": epoch, "episode_return": epoch, "episode_length": length}
-        judged.append([(one.steps, one.score) for one in candidates.add(row)])
+        evaluated.append([(one["steps"], one["score"]) for one in selection.add(row)])
     # the batch after their update, once it is known that episodes are short
-    assert judged == [[], [], [], [(3, 4)], [(4, 5)], [(5, 6)]]
-    again = Candidates({}, {}, over=1, delay=delay, longest=1000)
+    assert evaluated == [[], [], [], [(3, 4)], [(4, 5)], [(5, 6)]]
+    again = CheckpointSelection({}, {}, over=1, delay=delay, longest=1000)
     again.continue_after([{"episode_length": 50.0}])
     row = {"epoch": 7, "steps": 7, "episode_return": 7.0}
-    assert [again.add(row), [one.steps for one in again.add(row | {"steps": 8})]] == [[], [7]]
+    assert [again.add(row), [one["steps"] for one in again.add(row | {"steps": 8})]] == [[], [7]]
