@@ -1,8 +1,6 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
 import json
-import logging
-import logging.handlers
 from pathlib import Path
 
 import pytest
@@ -20,12 +18,6 @@ def command(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
     return lambda *arguments: (status_of(*arguments), *capsys.readouterr())
-
-
-def test_tab_completion_can_be_installed(command):
-    status, out, _ = command("-sc", "install=bash")
-    assert not status
-    assert "complete -o nospace -o default -F hydra_bash_completion" in out
 
 
 def test_configurations_are_shown(command):
@@ -73,18 +65,6 @@ def test_a_run_that_cannot_be_built_leaves_no_file(command):
     for where in ((), ("hydra.run.dir=mine/runs/first",)):
         assert "algo=cpo needs at least one entry" in command(*refused, *where)[0]
         assert not [path for path in Path.cwd().rglob("*") if path.is_file()]
-
-
-def test_torchrls_notes_are_kept_off_the_terminal_but_not_its_warnings(command, monkeypatch):
-    monkeypatch.delenv("RL_LOGGING_LEVEL", raising=False)
-    logger = logging.getLogger("torchrl")
-    monkeypatch.setattr(logger, "handlers", [kept := logging.handlers.BufferingHandler(9)])
-    monkeypatch.setattr(logger, "disabled", False)  # as import-linter leaves it
-    logger.setLevel(logging.INFO)
-    status, *_ = command(*SMALL, "frames=40", "algo=sac", "hydra.run.dir=runs/quiet")
-    logger.warning("of something that is wrong")
-    assert not status
-    assert [record.levelname for record in kept.buffer] == ["WARNING"]
 
 
 @pytest.mark.parametrize(
@@ -153,13 +133,6 @@ def test_a_backend_that_matplotlib_does_not_know_is_said_before_the_run_begins(t
     assert "'nonsense' is not a valid value for backend" in said.splitlines()[-1]
     assert "Traceback" not in said
     assert not (tmp_path / "run").exists()
-
-
-def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):
-    monkeypatch.setattr("safe_rl.training.building.os.sysconf", lambda name: 100)
-    status, *_ = command(*SMALL, "frames=40")
-    assert status == "frames_per_batch=40: a batch takes 0 GB, and there are 0 GB."
-    assert list(Path.cwd().rglob("*.csv")) == []
 
 
 @pytest.mark.parametrize(

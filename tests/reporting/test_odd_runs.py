@@ -1,7 +1,6 @@
 """One odd run never stops the report, and learns and shows nothing of this machine."""
 
 import json
-import math
 import os
 import re
 
@@ -132,13 +131,6 @@ def test_files_that_cannot_be_read_are_left_out_and_their_runs_kept(tmp_path):
     own = {part for place in skipped for part in place.parts if part.startswith("odd")}
     assert own == {f"odd{number}" for number in range(len(UNREADABLE_FILES))}
     assert len(skipped) == len(UNREADABLE_FILES)
-
-
-def test_many_runs_that_have_finished_no_episode_are_shown(tmp_path):
-    for number in range(7):
-        write_run(tmp_path, algo=f"mine{number}", returns=[math.nan], costs=[math.nan])
-    found = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
-    assert len(found.experiments) == 7
 
 
 def test_what_looks_odd_is_shown(tmp_path):

@@ -1,7 +1,6 @@
 """The learning curves: what is drawn, not how it looks."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -84,14 +83,6 @@ def test_a_fourth_panel_has_the_multipliers_there_are():
     assert len(drawn({"cost": 25.0})) == 3
 
 
-def test_a_single_epoch_is_drawn_as_a_point():
-    panels = drawn({"cost": 25.0}, {name: values[:1] for name, values in TABLE.items()})
-    markers = [{line.get_marker() for line in axes.lines} for axes in panels]
-    assert all("o" in found for found in markers)
-    lines = [line for axes in drawn({"cost": 25.0}) for line in axes.lines]
-    assert not any(line.get_marker() == "o" for line in lines)
-
-
 def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run():
     none = dict.fromkeys(("episode_return", "episode_cost"), [math.nan] * 7)
     panels = drawn({"cost": 25.0}, TABLE | none)
@@ -99,16 +90,6 @@ def test_without_a_finished_episode_panels_say_so_and_have_the_steps_of_the_run(
         ["no episode has ended"], ["no episode has ended"], [],
     ]  # fmt: skip
     assert {axes.get_xlim() for axes in panels} == {panels[2].get_xlim()}
-
-
-@pytest.mark.parametrize("limits", [{"cost": 25.0}, {"cost": 25.0, "cost_hazards": 10.0}])
-def test_a_legend_covers_no_line_and_touches_no_other_legend(limits):
-    figure = learning_curves(TABLE, limits, 1000, "title")
-    figure.draw_without_rendering()
-    extents = [axes.get_legend().get_window_extent() for axes in figure.axes]
-    for axes, legend in zip(figure.axes, extents, strict=True):
-        assert 0 <= legend.y0 < legend.y1 <= axes.xaxis.get_tightbbox().y0
-    assert all(left.x1 < right.x0 for left, right in pairwise(extents))
 
 
 def test_without_limits_the_aggregate_cost_is_drawn():

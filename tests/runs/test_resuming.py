@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 from point_mass import Forgetful, PointMass
 from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.checkpoint import CheckpointError
 
 from safe_rl.envs import SafetyGymEnv
@@ -208,24 +207,6 @@ def test_a_table_that_lacks_epochs_is_refused(tmp_path):
     trainer.resume()
     with pytest.raises(ValueError, match=r"holds 2 complete rows, but .* 4 epochs"):
         trainer.run()
-
-
-def test_tensorboard_forgets_what_is_done_again(tmp_path):
-    overrides = ["logger=tensorboard", "frames=640", "checkpoint.interval=1000"]
-    trainer = point_mass_trainer(tmp_path, *overrides)
-    trainer.run()
-    # as if it had been killed in the sixth epoch, after a checkpoint in the fourth
-    with trainer.writer.writing(trainer.progress.epoch, trainer.progress.steps):
-        for epoch in (5, 6):
-            lost = dict.fromkeys(read_table(tmp_path / "progress.csv"), -1.0)
-            trainer.writer.add(lost | {"epoch": epoch, "steps": 160 * epoch})
-    resumed = point_mass_trainer(tmp_path, "logger=tensorboard")
-    resumed.resume()
-    resumed.run()
-    table = read_table(tmp_path / "progress.csv")
-    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("policy_kl")
-    assert [event.step for event in events] == table["steps"]
-    assert [event.value for event in events] == pytest.approx(table["policy_kl"])
 
 
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
