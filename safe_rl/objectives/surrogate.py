@@ -182,7 +182,10 @@ class SurrogateLoss(Checked, SharesTensors):
             ValueError: If advantages do not match log-probabilities or multipliers in shape, or
                 the batch was not collected under ``torch.no_grad()``.
         """
-        distribution = self._policy(tensordict)
+        # A copy: actors write their loc and scale, which in the batch are the behaviour policy's.
+        observed = inputs_of(self.actor_network, tensordict)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            distribution = self.actor_network.get_dist(observed)
         log_weight = self._log_weight(tensordict, distribution)
         bonus = entropy(distribution)
         divergence = self._kl(tensordict, distribution, log_weight)
@@ -212,12 +215,6 @@ class SurrogateLoss(Checked, SharesTensors):
         """Means over the samples of cost surrogates [..., k], for any reduction: [k]."""
         means = [self._reduce_loss(cost, tensordict, reduction="mean") for cost in gain.unbind(-1)]
         return torch.stack(means)
-
-    def _policy(self, tensordict: TensorDictBase) -> Distribution:
-        # A copy: actors write their loc and scale, which in the batch are the behaviour policy's.
-        observed = inputs_of(self.actor_network, tensordict)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network.get_dist(observed)
 
     def _log_weight(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
         """log(π_θ(a|s) / π_k(a|s)), [..., 1]."""

@@ -94,12 +94,6 @@ class Element:
             return [self.label] if self.kind in TASKS[config.task].elements else []
         return [f"{self.label}{i}" for i in range(getattr(config, f"{self.kind}_num"))]
 
-    def observed(self, config: SafetyGymConfig) -> bool:
-        """Whether the observation has a lidar for this kind."""
-        exists = self.kind in TASKS[config.task].at_origin or self.names(config)
-        flag = getattr(config, self.flag or f"observe_{self.kind}")
-        return flag and (self.always_observed or bool(exists))
-
 
 def _box_geoms(config: SafetyGymConfig) -> tuple[Geom, ...]:
     s = config.box_size

@@ -99,7 +99,13 @@ def pseudo_lidar(
 def lidar_blocks(scene: Scene, device: torch.device) -> list[Block]:
     """Return all lidars of a configuration as one block; no block if there is no lidar."""
     config = scene.config
-    elements = [element for element in ELEMENTS if element.observed(config)]
+    existing = (*scene.slots, *TASKS[config.task].at_origin)
+    elements = [
+        element
+        for element in ELEMENTS
+        if getattr(config, element.flag or f"observe_{element.kind}")
+        and (element.always_observed or element.kind in existing)
+    ]
     if not elements:
         return []
     make = _pseudo if config.lidar_type == "pseudo" else _natural

@@ -8,6 +8,7 @@ observation are in the alphabetical order of their names (paper sections 4.1.1 a
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -106,30 +107,24 @@ def active_readings(config: SafetyGymConfig) -> list[Reading]:
     return [row for row in flagged if row.kind in kinds]
 
 
-def _joint_sensors(scene: Scene, kind: mujoco.mjtSensor, joint: mujoco.mjtJoint) -> list[int]:
-    """Return the ids of the robot's sensors of one type on one type of joint."""
-    model = scene.model
-    return [
-        i
-        for i in range(scene.robot_sensors)
-        if model.sensor_type[i] == kind and model.jnt_type[model.sensor_objid[i]] == joint
-    ]
-
-
 def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
     """Return the robot's sensors: raw values, hinges as (sin, cos), balls as rotation matrices."""
     config = scene.config
     if not config.observe_sensors:
         return []
-    sensor, joint = mujoco.mjtSensor, mujoco.mjtJoint
+    model, sensor, joint = scene.model, mujoco.mjtSensor, mujoco.mjtJoint
+    known = {model.sensor(i).name: i for i in range(scene.robot_sensors)}
+    on_joint: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for i in range(scene.robot_sensors):
+        if model.sensor_objtype[i] == mujoco.mjtObj.mjOBJ_JOINT:
+            on_joint[model.sensor_type[i], model.jnt_type[model.sensor_objid[i]]].append(i)
     for kind in (sensor.mjSENS_JOINTPOS, sensor.mjSENS_JOINTVEL):
-        for i in _joint_sensors(scene, kind, joint.mjJNT_SLIDE):
+        for i in on_joint[kind, joint.mjJNT_SLIDE]:
             raise ConfigError(
-                f"'robot_base': {config.robot_base} has the sensor '{scene.model.sensor(i).name}' "
+                f"'robot_base': {config.robot_base} has the sensor '{model.sensor(i).name}' "
                 "on a slide joint, but observations must not depend on the world's origin: remove "
                 "the sensor, or set 'observe_sensors' to False."
             )
-    known = {scene.model.sensor(i).name: i for i in range(scene.robot_sensors)}
     for name in config.sensors_obs:
         if name not in known:
             raise ConfigError(
@@ -139,11 +134,11 @@ def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
             )
     raw, angles, quaternions = [known[name] for name in config.sensors_obs], [], []
     if config.sensors_hinge_joints:
-        raw += _joint_sensors(scene, sensor.mjSENS_JOINTVEL, joint.mjJNT_HINGE)
-        angles += _joint_sensors(scene, sensor.mjSENS_JOINTPOS, joint.mjJNT_HINGE)
+        raw += on_joint[sensor.mjSENS_JOINTVEL, joint.mjJNT_HINGE]
+        angles += on_joint[sensor.mjSENS_JOINTPOS, joint.mjJNT_HINGE]
     if config.sensors_ball_joints:
-        raw += _joint_sensors(scene, sensor.mjSENS_BALLANGVEL, joint.mjJNT_BALL)
-        quaternions += _joint_sensors(scene, sensor.mjSENS_BALLQUAT, joint.mjJNT_BALL)
+        raw += on_joint[sensor.mjSENS_BALLANGVEL, joint.mjJNT_BALL]
+        quaternions += on_joint[sensor.mjSENS_BALLQUAT, joint.mjJNT_BALL]
     # as in 2019, a listed sensor that measures a joint is observed once, as one of a joint
     raw = [i for i in dict.fromkeys(raw) if i not in (*angles, *quaternions)]
     if not config.sensors_angle_components:
@@ -154,7 +149,7 @@ def sensor_blocks(scene: Scene, device: torch.device) -> list[Block]:
         (quaternions, (3, 3), lambda q: rotation_matrix(q.unflatten(1, (-1, 4)))),
     )
     return [
-        _sensor_block(scene.model, sensors, shape, convert, device)
+        _sensor_block(model, sensors, shape, convert, device)
         for sensors, shape, convert in groups
         if sensors
     ]
