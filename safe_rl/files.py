@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import gzip
 import json
-import math
 import os
 import re
 import secrets
@@ -82,7 +81,7 @@ def read_bounded(path: Path, most: int = _MOST_BYTES, *, packed: bool = False) -
         OSError: If it cannot be read.
     """
     # without O_NONBLOCK, opening a pipe waits for a writer
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
             raise ValueError(f"{path.name} is no regular file")
@@ -121,25 +120,20 @@ def read_yaml(path: Path) -> Any:
         OSError: If it cannot be read.
     """
     try:
-        text = read_bounded(path).decode("utf-8")
-        _check_structure(text)
+        text, level = read_bounded(path).decode("utf-8"), 0
+        # the parser's events need no recursion
+        for event in yaml.parse(text, Loader=_Loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise ValueError("it has YAML aliases, which no run writes")
+            level += isinstance(event, yaml.CollectionStartEvent)
+            level -= isinstance(event, yaml.CollectionEndEvent)
+            if level > _MOST_LEVELS:
+                raise ValueError(f"it is nested in more than {_MOST_LEVELS} levels")
         return yaml.load(text, Loader=_Loader)
     # PyYAML looks up a value such as `!!bool perhaps`, which raises a KeyError
     except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"{path.name} cannot be read ({reason})") from error
-
-
-def _check_structure(text: str) -> None:
-    """Refuse aliases and deep nesting, by the parser's events, which need no recursion."""
-    level = 0
-    for event in yaml.parse(text, Loader=_Loader):
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError("it has YAML aliases, which no run writes")
-        level += isinstance(event, yaml.CollectionStartEvent)
-        level -= isinstance(event, yaml.CollectionEndEvent)
-        if level > _MOST_LEVELS:
-            raise ValueError(f"it is nested in more than {_MOST_LEVELS} levels")
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -203,16 +197,8 @@ def replace_text(path: Path, text: str) -> None:
 
 def replace_json(path: Path, content: Any) -> None:
     """Write a JSON file by :func:`replacing`; numbers that are not finite become null."""
-    text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
-    replace_text(path, text + "\n")
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, Mapping):
-        return {name: _finite(value) for name, value in content.items()}
-    if isinstance(content, list | tuple):
-        return list(map(_finite, content))
-    return None if isinstance(content, float) and not math.isfinite(content) else content
+    plain = json.loads(json.dumps(content, default=dict), parse_constant=lambda _: None)
+    replace_text(path, json.dumps(plain, indent=2, ensure_ascii=False) + "\n")
 
 
 def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:

@@ -12,6 +12,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from safe_rl.checks import is_number
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitState, LimitTracker
@@ -245,7 +246,7 @@ def check_cost_limits(
                 f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}; in Safety "
                 "Gym's environments env.constrain_<kind>=true adds those of another kind."
             )
-        if not isinstance(limit, int | float) or not 0 <= limit < math.inf:
+        if not is_number(limit) or limit < 0:
             raise ValueError(
                 f"The limit of '{key}' is {limit!r}: it must be a number of at least 0, the "
                 "undiscounted cost allowed per episode. Leave out a cost that has no limit."
