@@ -41,35 +41,30 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
 def evaluate_run(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> Evaluation:
-    """:func:`safe_rl.evaluation.evaluate` with this package's environments and benchmark.
+    """:func:`safe_rl.evaluation.evaluate`, of a policy of the package on a copy.
 
     Raises:
         ValueError: If the options ask for a certificate or for variations.
     """
-    from safe_rl.cli.report import suite
     from safe_rl.evaluation import evaluate
-    from safe_rl.evaluation.loading import maker_of
     from safe_rl.evaluation.policies import writable_copy
 
     directory = writable_copy(directory)
     if options.certify or options.variations is not None:
         raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
-    make = maker_of(directory)
-    return evaluate(directory, options, make_env=make, suite=suite(), progress=progress)
+    return evaluate(directory, options, progress=progress)
 
 
 def evaluate_varied(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> tuple[Varied, Path]:
     """Run a policy under ``options.variations``; return the results, and the path of a picture."""
-    from safe_rl.evaluation.loading import maker_of
     from safe_rl.evaluation.policies import writable_copy
     from safe_rl.evaluation.variations import evaluate_variations
     from safe_rl.reporting.figures import draw_variations
 
     directory = writable_copy(directory)
-    make = maker_of(directory)
-    varied = evaluate_variations(directory, options, make_env=make, progress=progress)
+    varied = evaluate_variations(directory, options, progress=progress)
     picture = Run(directory).variations_file(options.name, "png")
     draw_variations(varied.rows, varied.cost_limits, picture)
     return varied, picture

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
+from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.measuring import PolicyEvaluation
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
 from safe_rl.files import check_no_links, read_json, replace_json, replacing
@@ -41,7 +42,7 @@ def certify(
     directory: Path,
     options: CertificateOptions,
     *,
-    make_env: Callable[..., EnvBase],
+    make_env: Callable[..., EnvBase] | None = None,
     num_threads: int = 0,
     progress: bool = False,
 ) -> Certificate | None:
@@ -55,7 +56,8 @@ def certify(
     Args:
         directory: Folder of the run.
         options: Options of the test, such as the number of episodes.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
+        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments;
+            None: those of the run.
         num_threads: Threads that step environments; 0 is one per core.
         progress: Whether to show a bar.
 
@@ -76,7 +78,8 @@ def certify(
     plain = EvaluationOptions(
         device=device, num_threads=num_threads, deterministic=options.deterministic
     )
-    evaluations = [PolicyEvaluation(config, path, plain, make_env) for path in candidates]
+    make = make_env or maker_of(directory)
+    evaluations = [PolicyEvaluation(config, path, plain, make) for path in candidates]
     asked = ("most_over", "bound", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in asked})
     number, error = _spend(run, options, candidates)

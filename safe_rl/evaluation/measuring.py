@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed
 from safe_rl.evaluation.loading import (
     for_evaluation,
     load_policy,
+    maker_of,
     override_env,
 )
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
@@ -27,11 +27,7 @@ from safe_rl.evaluation.video import check_camera, record_episode, video_format,
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
-from safe_rl.scores.benchmark import Scores, Suite, normalise
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
-
-# keys of the choice of layouts: with other values it is still the same environment
-_LAYOUTS = ("layout_seeds", "layout_seeds_first")
 
 
 @dataclass(frozen=True)
@@ -161,8 +157,7 @@ def evaluate(
     directory: Path,
     options: EvaluationOptions,
     *,
-    make_env: Callable[..., EnvBase],
-    suite: Suite,
+    make_env: Callable[..., EnvBase] | None = None,
     progress: bool = False,
 ) -> Evaluation:
     """Run a trained policy for whole episodes and write estimates into the run's folder.
@@ -171,8 +166,7 @@ def evaluate(
         directory: Folder of a run.
         options: What to evaluate.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments
-            from a run's ``env``, see :func:`safe_rl.envs.make_env`.
-        suite: Environments with published scores.
+            from a run's ``env``; None: :func:`safe_rl.envs.make_env` with the run's own robot.
         progress: Whether to show a bar.
 
     Raises:
@@ -188,7 +182,7 @@ def evaluate(
     checkpoint = run.find_checkpoint(options.checkpoint)
     changed = config.copy()
     changed.env = override_env(config, options.env)
-    evaluation = PolicyEvaluation(changed, checkpoint, options, make_env)
+    evaluation = PolicyEvaluation(changed, checkpoint, options, make_env or maker_of(directory))
     # some environments draw pictures only if this key asks for it
     drawing = {"render_mode": "rgb_array"} if "render_mode" in evaluation.node else {}
     summary, table = (run.evaluation_file(options.name, kind) for kind in ("json", "csv"))
@@ -200,8 +194,7 @@ def evaluate(
         with closing(evaluation.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
     episodes, facts = evaluation.run(progress=progress, record=kept[0] if kept else None)
-    reference = suite.reference(evaluation.node, but_for=_LAYOUTS)
-    estimates = summarise(episodes, facts["cost_limits"], reference, options.cvar_alpha)
+    estimates = summarise(episodes, facts["cost_limits"], options.cvar_alpha)
     known = shared_layouts(
         OmegaConf.to_container(config.env),  # type: ignore[arg-type]
         evaluation.node,
@@ -226,29 +219,25 @@ def check_places(directory: Path, places: Iterable[Path]) -> None:
 
 
 def summarise(
-    episodes: Episodes,
-    cost_limits: Mapping[str, float],
-    reference: Scores | None,
-    cvar_alpha: float,
+    episodes: Episodes, cost_limits: Mapping[str, float], cvar_alpha: float
 ) -> dict[str, Estimate]:
     """Estimate everything that is reported of an evaluation.
 
     Args:
         episodes: Returns, lengths and costs of episodes.
         cost_limits: Cost key -> d, undiscounted cost per episode.
-        reference: Characteristic metrics of the environment, for normalised scores; or None.
         cvar_alpha: Share of the costliest episodes, whose mean cost is the CVaR.
 
     Returns:
         Estimates by name: ``episode_return``, ``episode_length``, ``episode_<key>`` for every cost
         key; for those with a limit (the first cost where none has) ``cvar_<key>`` and
-        ``over_limit_<key>``; ``normalised_return`` and ``normalised_violation``.
+        ``over_limit_<key>``.
 
     Examples:
         >>> import torch
         >>> two = torch.tensor([1.0, 3.0])
         >>> episodes = Episodes(two, two, {"cost": torch.tensor([10.0, 30.0])})
-        >>> summary = summarise(episodes, {"cost": 25.0}, None, cvar_alpha=0.5)
+        >>> summary = summarise(episodes, {"cost": 25.0}, cvar_alpha=0.5)
         >>> [summary[name].value for name in ("episode_cost", "cvar_cost", "over_limit_cost")]
         [20.0, 30.0, 0.5]
     """
@@ -259,14 +248,6 @@ def summarise(
         estimates[f"cvar_{key}"] = cvar(costs, cvar_alpha)
         if key in cost_limits:
             estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
-    if reference is not None:
-        # scores are monotone in J_r and J_c, so ends of intervals become ends of intervals
-        figures = estimates["episode_return"], estimates["episode_cost"], math.nan
-        limit = cost_limits.get("cost", math.nan)
-        scores = normalise(*figures, limit=limit, reference=reference)
-        shown = ("return", "violation") if "cost" in cost_limits else ("return",)
-        for name, ends in zip(shown, scores, strict=False):
-            estimates[f"normalised_{name}"] = Estimate(*map(float, ends))
     return estimates
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase
 
-from safe_rl.evaluation.loading import check_env_keys, override_env
+from safe_rl.evaluation.loading import check_env_keys, maker_of, override_env
 from safe_rl.evaluation.measuring import (
     PolicyEvaluation,
     check_places,
@@ -230,7 +230,7 @@ def evaluate_variations(
     directory: Path,
     options: EvaluationOptions,
     *,
-    make_env: Callable[..., EnvBase],
+    make_env: Callable[..., EnvBase] | None = None,
     progress: bool = False,
 ) -> Varied:
     """Run a trained policy in its own environment and under ``options.variations``.
@@ -241,7 +241,7 @@ def evaluate_variations(
     """
     check_options(options)
     variations = read_variations(options.variations)
-    run = Run(directory)
+    run, make_env = Run(directory), make_env or maker_of(directory)
     config = run.config
     config.env = override_env(config, options.env)
     checkpoint = run.find_checkpoint(options.checkpoint)
@@ -271,7 +271,7 @@ def evaluate_variations(
             left_out.append((variation, str(error)))
             continue
         facts = facts or row_facts
-        estimates = summarise(episodes, row_facts["cost_limits"], None, options.cvar_alpha)
+        estimates = summarise(episodes, row_facts["cost_limits"], options.cvar_alpha)
         rows.append(VariedRow(variation, estimates))
     _write(file, rows)
     return Varied(tuple(rows), tuple(left_out), facts, file)

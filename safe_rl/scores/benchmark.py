@@ -6,7 +6,7 @@ Tables 1 and 2, and later re-implementations.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, NamedTuple
@@ -95,14 +95,9 @@ class Suite:
         differ = [key for key in keys if complete.get(key, ...) != standard.get(key, ...)]
         return {key: complete.get(key) for key in differ if key != "name"}
 
-    def name_of(self, node: Node, *, but_for: Collection[str] = ()) -> str | None:
-        """Name of the environment that a configuration equals, ignoring keys `but_for`; or None."""
-        changes = self.changes(node)
-        return None if changes is None or set(changes) - set(but_for) else node["name"]
-
-    def reference(self, node: Node, *, but_for: Collection[str] = ()) -> Scores | None:
-        """Scores to normalise by, if there are any for the environment of `name_of`."""
-        return REFERENCE.get(self.name_of(node, but_for=but_for) or "")
+    def name_of(self, node: Node) -> str | None:
+        """Name of the environment that a configuration equals; or None."""
+        return None if self.changes(node) != {} else node["name"]
 
 
 SLATES: dict[str, tuple[str, ...]] = {

@@ -28,7 +28,7 @@ from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation import Certificate, certify
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
-from safe_rl.evaluation.loading import keep_robot, maker_of, robot_of, transforms_of
+from safe_rl.evaluation.loading import keep_robot, robot_of, transforms_of
 from safe_rl.evaluation.settings import certificate_options
 from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
@@ -171,11 +171,8 @@ def certify_run(
     run = Run(directory)
     asked = {**(changes or {}), **({"deterministic": True} if deterministic else {})}
     options = certificate_options(run.config, asked)
-    make = maker_of(run.directory)
     with lock_folder(run.lock_file):  # an unwritable folder is found before hours of tests
-        return certify(
-            run.directory, options, make_env=make, num_threads=num_threads, progress=True
-        )
+        return certify(run.directory, options, num_threads=num_threads, progress=True)
 
 
 def _complete(config: DictConfig, run: Run) -> DictConfig | None:

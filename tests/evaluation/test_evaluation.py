@@ -1,7 +1,6 @@
 """The evaluate command on a tiny trained run: what it runs, writes and refuses."""
 
 import csv
-import functools
 import json
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from omegaconf import OmegaConf
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.cli.evaluate import main
 from safe_rl.envs import make_env
-from safe_rl.scores.benchmark import REFERENCE
 
 
 def read_columns(path):
@@ -38,25 +36,9 @@ def test_the_summary_is_that_of_the_episodes(run):
     worst = np.sort(episodes["cost"])[::-1]
     assert values["cvar_cost"] == pytest.approx((worst[:3].sum() + 0.5 * worst[3]) / 3.5)
     assert values["over_limit_cost"] == pytest.approx((episodes["cost"] > 25).mean())
-    # another episode length than the benchmark's: nothing to normalise by
-    assert "normalised_return" not in values
     assert written["steps"] == 320
     assert written["layouts_trained_on"] == 0.0
     assert written["seed"] != 0
-
-
-def test_scores_are_normalised_where_the_environment_is_the_benchmarks(run):
-    limits = {"cost_limits": {"cost": 0.0}}
-    config = OmegaConf.merge(OmegaConf.load(run / "config.yaml"), limits)
-    OmegaConf.save(config, run / "config.yaml")
-    found = evaluate(run, options(episodes=6, num_envs=6, env={"num_steps": 1000})).estimates
-    reference = REFERENCE["PointGoal1"]
-    assert found["normalised_return"].value == pytest.approx(
-        found["episode_return"].value / reference.episode_return
-    )
-    cost = found["episode_cost"].value
-    assert cost > 0.0
-    assert found["normalised_violation"].value == pytest.approx(cost / reference.episode_cost)
 
 
 def test_the_seed_decides_and_the_mean_action_is_not_sampled(run):
@@ -86,18 +68,6 @@ def test_layouts_can_be_those_of_training_or_others(run):
 def change_config(run, **changes):
     config = yaml.safe_load((run / "config.yaml").read_text())
     (run / "config.yaml").write_text(yaml.safe_dump({**config, **changes}))
-
-
-def test_an_environment_of_another_kind_has_no_published_scores(run, monkeypatch):
-    """What fulfils the contract of environments and calls itself PointGoal1."""
-    change_config(run, env={"_target_": "mine.build", "name": "PointGoal1", "cost_keys": ["cost"]})
-    make = functools.partial(make_env, "PointGoal1")
-    monkeypatch.setattr(
-        "safe_rl.evaluation.loading.make_env", lambda node, **kwargs: make(**kwargs)
-    )
-    found = evaluate(run, options(episodes=2)).estimates
-    assert found["episode_length"].value == 1000
-    assert "normalised_return" not in found
 
 
 def test_a_foreign_configuration_learns_nothing_of_this_machine(run, capsys, monkeypatch):
