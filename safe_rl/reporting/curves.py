@@ -1,4 +1,4 @@
-"""Learning curves (the paper's Figures 7 to 9): few in a panel, or a panel per algorithm."""
+"""Learning curves over environments, also as the paper's Figures 7 to 9."""
 
 from __future__ import annotations
 
@@ -34,7 +34,6 @@ _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
 _NUM_MARKERS = 6  # of a curve
 _ROW_HEIGHT = 2.4  # of a row of panels [inch]
 _TITLES = ("Return", "Episode cost", "Cost rate")
-_MULTIPLES = 6  # small panels in a row
 
 
 class Average(NamedTuple):
@@ -49,14 +48,11 @@ class Average(NamedTuple):
     high: np.ndarray
 
 
-def average(
-    runs: Sequence[Run], column: str, *, smooth: bool, with_band: bool = True
-) -> Average | None:
+def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None:
     """Average a column of the runs' tables over seeds; None without runs, or if one has no value.
 
     The curve ends with the shortest run. Between epochs, and where no episode finished, values are
     interpolated. With ``smooth`` values are moving means over as many epochs as final figures.
-    Without the band, the interval is NaN, which saves most of the time.
     """
     series = []
     for run in runs:
@@ -72,9 +68,7 @@ def average(
     longest = max(len(steps) for steps, _ in series)
     grid = np.linspace(start, stop, min(longest, _NUM_POINTS)) if stop > start else np.array([stop])
     heights = np.stack([np.interp(grid, steps, values) for steps, values in series], -1)
-    nothing = np.full(grid.shape, np.nan)
-    ends = t_interval(heights) if with_band else (nothing, nothing)
-    return Average(grid, heights.mean(-1), *ends)
+    return Average(grid, heights.mean(-1), *t_interval(heights))
 
 
 def draw_learning_curves(
@@ -176,64 +170,6 @@ def _coverage(experiments: Sequence[Experiment]) -> str:
     return algorithms + (f", {several} {unit}" if seeds else "")
 
 
-def draw_small_multiples(
-    experiments: Sequence[Experiment], key: str, styles: Mapping[str, Style], width: float = WIDTH
-) -> Figure:
-    """Draw return, episode cost and cost rate of many algorithms, a column of panels for each.
-
-    The other algorithms are grey in the background. If all curves end below four times the highest
-    limit, higher values are cut off. All experiments have one environment and number of steps.
-    """
-    columns: dict[str, list[Experiment]] = {}
-    for experiment in experiments:
-        columns.setdefault(experiment.base, []).append(experiment)
-    means = {e.label: _curves(e.finished, key, with_band=False) for e in experiments}
-    most = max(1, round(_MULTIPLES * width / WIDTH))
-    together = min(most, -(-len(columns) // -(-len(columns) // most)))
-    bands = -(-len(columns) // together)
-    figure = Figure(figsize=(width, 0.3 + 4.2 * bands), layout="constrained")
-    panels = figure.subplots(3 * bands, together, squeeze=False)
-    for number, own in enumerate(columns.values()):
-        band, column = divmod(number, together)
-        axes = list(panels[3 * band : 3 * band + 3, column])
-        others = [means[label] for label in means if label not in {e.label for e in own}]
-        for axis, *curves in zip(axes, *others, strict=True):
-            for curve in filter(None, curves):
-                axis.plot(curve.steps, curve.mean, color="0.88", linewidth=0.8, zorder=0)
-        for experiment in own:
-            draw_experiment(experiment, key, axes, styles[experiment.label])
-        title, *settings = own[0].label.partition(" (")
-        colour = styles[own[0].label].colour
-        axes[0].set_title(literal(clean(title, 30)), fontsize=10, fontweight="bold", color=colour)
-        if len(own) > 1 or any(settings):
-            handles, names = axes[0].get_legend_handles_labels()
-            shown = [clean(n.partition(" (")[2].removesuffix(")") or "default", 50) for n in names]
-            axes[0].legend(handles, shown, fontsize=6, frameon=False, handlelength=2.5)
-        for panel, height in limits_of(own, key):
-            axes[panel].axhline(height, **LIMIT_STYLE)
-        set_axes(axes, ticks=3)
-    for kind, title in enumerate(_TITLES):
-        finals = [c.mean[-1] for found in means.values() if (c := found[kind]) is not None]
-        limits = [height for panel, height in limits_of(experiments, key) if panel == kind]
-        used, unused = np.split(panels[kind::3].ravel(), [len(columns)])
-        _level(used, finals, limits)
-        for axis in unused:
-            axis.set_axis_off()
-        for axis in panels[kind::3, 0]:
-            axis.set_ylabel(title)
-    return figure
-
-
-def _level(panels: Iterable[Axes], finals: Sequence[float], limits: Sequence[float]) -> None:
-    """Set one scale for all panels of a quantity."""
-    low, high = zip(*(axis.get_ylim() for axis in panels), strict=True)
-    cut = 4 * max(limits, default=0.0)
-    top = cut if cut > max(finals, default=np.inf) else max(high)
-    for axis in panels:
-        axis.tick_params(labelsize=8)
-        axis.set_ylim(min(low), min(top, max(high)))
-
-
 def limits_of(experiments: Iterable[Experiment], key: str) -> list[tuple[int, float]]:
     """Index of a panel, and height of a limit in it: 1 and d; 2, the cost rate, and d / T_ep."""
     pairs = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
@@ -249,10 +185,10 @@ def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
     return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
 
 
-def _curves(runs: Sequence[Run], key: str, *, with_band: bool = True) -> list[Average | None]:
+def _curves(runs: Sequence[Run], key: str) -> list[Average | None]:
     """Return, episode cost and cost rate."""
     columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
-    return [average(runs, name, smooth=s, with_band=with_band) for name, s in columns]
+    return [average(runs, name, smooth=s) for name, s in columns]
 
 
 def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:

@@ -25,8 +25,6 @@ from safe_rl.reporting.curves import (
     curve_rows,
     draw_benchmark,
     draw_learning_curves,
-    draw_small_multiples,
-    drawn_keys,
 )
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.tables import Table, clean, short_number
@@ -204,25 +202,23 @@ def benchmark_figures(experiments: Sequence[Experiment], width: float) -> list[D
 
 
 def _curves(experiments: Sequence[Experiment], styles: Styles, width: float) -> list[Drawing]:
-    """A picture of small multiples for each group of many curves; the others as rows."""
-    what = "Return, episode cost and cost rate"
-    rows, drawings = [], []
+    """Pictures with a row per environment; one with many curves is shared out among pictures."""
+    rows, pictures = [], []
     for group in _by_environment(experiments):
         for steps in sorted({e.planned_steps for e in group}):
-            own = [e for e in group if e.planned_steps == steps]
-            if len(own) <= _MOST_CURVES:
-                rows.append(own)
-                continue
-            for key in drawn_keys(own):
-                title = f"{group[0].environment}, {short_number(steps)} steps"
-                title += "" if key == "cost" else f", {clean(key, 40)}"
-                figure = draw_small_multiples(own, key, styles, width)
-                says = f"{what}, a column per algorithm: {title}"
-                drawings.append(Drawing(f"curves_{title}", title, figure, says))
-    for shown in (rows[n : n + _MOST_ROWS] for n in range(0, len(rows), _MOST_ROWS)):
-        names = ", ".join(dict.fromkeys(own[0].environment for own in shown))
-        figure = draw_learning_curves([e for own in shown for e in own], styles, width)
-        says = f"{what} over environment steps: {names}"
+            members = [e for e in group if e.planned_steps == steps]
+            if len(members) <= _MOST_CURVES:
+                rows.append(members)
+            else:
+                starts = range(0, len(members), _MOST_CURVES)
+                pictures += [members[n : n + _MOST_CURVES] for n in starts]
+    pictures += [[*chain(*rows[n : n + _MOST_ROWS])] for n in range(0, len(rows), _MOST_ROWS)]
+    drawings = []
+    for members in pictures:
+        names = ", ".join(dict.fromkeys(e.environment for e in members))
+        algorithms = ", ".join(dict.fromkeys(e.label for e in members))
+        figure = draw_learning_curves(members, styles, width)
+        says = f"Return, episode cost and cost rate over environment steps: {names}; {algorithms}"
         drawings.append(Drawing("curves", "", figure, says))
     return drawings
 

@@ -5,7 +5,7 @@ import pytest
 from synthetic import experiments_in, write_run
 
 from safe_rl.files import CONF
-from safe_rl.reporting.curves import draw_learning_curves, draw_small_multiples
+from safe_rl.reporting.curves import draw_learning_curves
 from safe_rl.reporting.figures import algorithm_styles, compared, draw_fronts
 from safe_rl.reporting.page import benchmark_figures
 from safe_rl.reporting.scoring import final_table
@@ -97,26 +97,6 @@ def test_the_algorithms_of_the_package_are_told_apart(tmp_path):
         write_run(tmp_path, algo=name)
     styles = algorithm_styles(experiments_in(tmp_path)).values()
     assert len({style[:2] for style in styles}) == len({s.colour for s in styles}) == len(names)
-
-
-def test_many_algorithms_have_a_column_each(tmp_path):
-    for algo, cost in {"ppo": 30.0, "cpo": 20.0, "sac": 25.0}.items():
-        for limit in (10.0, 50.0):
-            folder = f"{algo}{limit}"
-            write_run(tmp_path, algo=algo, limits={"cost": limit}, **ROWS, costs=[500, cost, cost],
-                      folder=folder)  # fmt: skip
-    experiments = experiments_in(tmp_path)
-    figure = draw_small_multiples(experiments, "cost", algorithm_styles(experiments))
-    panels = np.array(figure.axes).reshape(3, 3)
-    assert [axis.get_title() for axis in panels[0]] == ["PPO", "CPO", "SAC"]
-    # its own two, the limits, and the four of the others, which are grey
-    for axis in panels[1]:
-        colours = [line.get_color() for line in axis.lines]
-        assert colours.count("0.88") == 4
-        assert len(set(colours) - {"0.88", "#c00000"}) == 1
-        assert axis.get_ylim() == (0, 200)
-    legend = [text.get_text() for text in panels[0, 0].get_legend().get_texts()]
-    assert legend == ["cost ≤ 10", "cost ≤ 50"]
 
 
 def fronts(experiments):
