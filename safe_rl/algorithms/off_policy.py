@@ -119,6 +119,7 @@ class OffPolicy(Resumable, Algorithm):
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
             example=env.fake_tensordict(),
+            with_later=loss.retrace is not None,
             **others,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
@@ -126,7 +127,7 @@ class OffPolicy(Resumable, Algorithm):
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
         noise, colour = map(config.exploration.get, ("noise", "colour"))
         return cls(
-            policy=exploring(networks["actor"], env, noise, colour),
+            policy=exploring(networks["actor"], env, noise, colour, loss.retrace is not None),
             networks=networks,
             constraints=constraints,
             multiplier=multiplier,
@@ -261,12 +262,18 @@ def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
 
 
 def exploring(
-    actor: TensorDictModuleBase, env: EnvBase, noise: float = 0.0, colour: float | None = None
+    actor: TensorDictModuleBase,
+    env: EnvBase,
+    noise: float = 0.0,
+    colour: float | None = None,
+    is_scored: bool = False,
 ) -> ExploringPolicy:
     """The exploring policy of an actor, within the bounds of an environment's actions."""
     spec, decisions = bounded_actions(env), -(-env.max_episode_steps // env.steps_per_decision)
     coloured = ColouredNoise(colour, decisions) if colour else None
-    return ExploringPolicy(actor, spec.low, spec.high, noise=noise, coloured=coloured)
+    return ExploringPolicy(
+        actor, spec.low, spec.high, noise=noise, coloured=coloured, is_scored=is_scored
+    )
 
 
 def build_networks(

@@ -94,6 +94,7 @@ _SILENT: dict[str, Hashable] = {
     "env.observe_privileged": False,
     "exploration.colour": 0.0,
     "loss.cost_gamma": None,
+    "loss.retrace": None,
     "model.critic_observes": ("observation",),
 }
 
