@@ -80,14 +80,15 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
     has = {name for row in [*rows, *records] for name in row}
     columns = {
         "algorithm": "{algorithm}",
-        "seeds": "{seeds:d}",
-        "steps": "{fewest_steps:,}| to {most_steps:,}",
-        "$J_r$": spread("episode_return", 2),
         **({"cost": "{cost}"} if len(keys) > 1 else {}),
+        # first what a limit is on: a phone shows two or three columns
         "$J_c$": spread("mean", 1),
         **({"limited measure": "{measure:.1f}"} if "measure" in has else {}),
         "$d$": "{limit:g}",
+        "$J_r$": spread("episode_return", 2),
         r"$\rho_c$": spread("rate", 4),
+        "seeds": "{seeds:d}",
+        "steps": "{fewest_steps:,}| to {most_steps:,}",
         **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
     if "paper_episode_return" in has:
