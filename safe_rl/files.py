@@ -81,7 +81,7 @@ def read_bounded(path: Path, most: int = _MOST_BYTES, *, packed: bool = False) -
         OSError: If it cannot be read.
     """
     # without O_NONBLOCK, opening a pipe waits for a writer
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         about = os.fstat(file.fileno())
         if not stat.S_ISREG(about.st_mode):
             raise ValueError(f"{path.name} is no regular file")

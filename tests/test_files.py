@@ -130,6 +130,13 @@ def test_what_unpacks_to_more_than_an_archive_has_is_refused(tmp_path):
         read_archive(tmp_path)
 
 
+def test_a_table_of_more_columns_than_a_run_has_is_refused(tmp_path):
+    path = tmp_path / "progress.csv"
+    path.write_text("\n".join(",".join(map(str, range(100_000))) for _ in range(2)) + "\n")
+    with pytest.raises(ValueError, match="100,000 columns"):
+        table.read_table(path)
+
+
 def test_runs_are_found_while_folders_of_a_checkpoint_come_and_go(tmp_path, monkeypatch):
     for run in ("b", "a"):
         (tmp_path / run / "checkpoints" / ".stage").mkdir(parents=True)

@@ -17,7 +17,7 @@ from safe_rl.cli.user_code import import_modules
 from safe_rl.envs import SUITE, env_node, resolve
 from safe_rl.evaluation.settings import option
 from safe_rl.files import check_place, printable
-from safe_rl.reporting import Report, build_report, write_report
+from safe_rl.reporting import Look, Report, build_report, write_report
 from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
 from safe_rl.scores.benchmark import SEEDS, Suite
@@ -48,7 +48,9 @@ class ReportOptions:
     title: str | None = option(None, "heading; null: the folder's name")
     formats: Annotated[str, _FORMATS] = option("png", "of the pictures, such as png,svg,pdf")
     width: Annotated[float, Interval(ge=2, le=40)] = option(12.0, "of the pictures [inch]")
+    panels: bool = option(False, "write every panel of a picture to a file of its own, too")
     labels: dict[str, str] = option(dict, "names to show, such as '{cpo: CPO (ours)}'")
+    columns: str | None = option(None, "columns of tables.tex, such as algorithm,J_r,J_c")
 
 
 def suite() -> Suite:
@@ -71,6 +73,13 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         raise ValueError(f"{out} is a link: remove it, or give out=FOLDER.")
     if root.is_dir():
         check_place(out / "report.html", "out=FOLDER writes the report elsewhere.")
+    look = Look(
+        formats=_listed(options.formats),
+        width=options.width,
+        panels=options.panels,
+        labels=options.labels,
+        columns=_listed(options.columns),
+    )
     result = build_report(
         root,
         suite(),
@@ -78,11 +87,9 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
         unfinished=options.unfinished,
         algorithms=_listed(options.algos),
         baselines=[Path(place).expanduser() for place in _listed(options.baselines)],
-        labels=options.labels,
-        width=options.width,
+        look=look,
     )
-    title = options.title or root.resolve().name
-    page = write_report(result, out, title, _listed(options.formats))
+    page = write_report(result, out, options.title or root.resolve().name, look)
     if options.archive is not None:
         archive_runs(result.runs, root, Path(options.archive).expanduser())
     return result, page

@@ -6,7 +6,7 @@ import base64
 import datetime
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from itertools import chain, count, groupby, starmap
@@ -36,6 +36,25 @@ _MOST_CURVES = 6  # in one panel
 _FEWEST_ENVIRONMENTS = 3  # of the benchmark, with which its figures are drawn
 _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(encoding="utf-8"))
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a report is written.
+
+    Attributes:
+        formats: Formats of the pictures: png, svg, pdf. PNG is always written, for the page.
+        width: Width of the pictures [inch].
+        panels: Whether every panel of a picture has a file of its own, too.
+        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
+        columns: Columns of the tables in LaTeX, such as ``algorithm`` and ``J_c``; empty: all.
+    """
+
+    formats: Sequence[str] = ("png",)
+    width: float = figures.WIDTH
+    panels: bool = False
+    labels: Mapping[str, str] = field(default_factory=dict)
+    columns: Sequence[str] = ()
 
 
 class Drawing(NamedTuple):
@@ -88,8 +107,7 @@ def build_report(
     unfinished: bool,
     algorithms: Sequence[str] = (),
     baselines: Sequence[Path] = (),
-    labels: Mapping[str, str] | None = None,
-    width: float = figures.WIDTH,
+    look: Look = Look(),  # noqa: B008, it is frozen
 ) -> Report:
     """Find the runs below a folder, and make the sections of a report.
 
@@ -101,8 +119,7 @@ def build_report(
         algorithms: Names in ``conf/algo`` of the algorithms to report; empty: all.
         baselines: Folders or archives of other runs, which are put beside these where they have the
             same environments; they keep the name of their folder.
-        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
-        width: Width of the pictures [inch].
+        look: How it is written.
 
     Raises:
         FileNotFoundError: If there is no run.
@@ -115,7 +132,7 @@ def build_report(
             raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
     chosen += _baselines(baselines, {run.environment for run in chosen})
-    experiments, repeated = group_runs(chosen, suite, labels)
+    experiments, repeated = group_runs(chosen, suite, look.labels)
     skipped |= repeated
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
@@ -130,11 +147,11 @@ def build_report(
             "curves",
             "Learning curves",
             [
-                *benchmark_figures(experiments, width),
-                *_curves(experiments, styles, width),
+                *benchmark_figures(experiments, look.width),
+                *_curves(experiments, styles, look.width),
             ],
         ),
-        ("fronts", "Return against cost", _fronts(groups, finals, styles, width)),
+        ("fronts", "Return against cost", _fronts(groups, finals, styles, look.width)),
         (
             "normalised",
             "Normalised scores",
@@ -223,7 +240,7 @@ def _curves(experiments: Sequence[Experiment], styles: Styles, width: float) -> 
     return drawings
 
 
-def write_report(report: Report, out: Path, title: str, formats: Sequence[str] = ()) -> Path:
+def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> Path:  # noqa: B008
     """Write a report into a folder: a page, pictures, tables as CSV and all of them in LaTeX.
 
     ``curves.csv`` has the points of all learning curves, a row for each.
@@ -233,7 +250,7 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
         out: The folder; it is made if it does not exist, and files of an earlier report are
             replaced.
         title: Heading of the page.
-        formats: Formats of the pictures besides PNG, which the page shows: svg, pdf.
+        look: How it is written.
 
     Returns:
         Path of the page, ``report.html``.
@@ -245,7 +262,7 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
     out.mkdir(parents=True, exist_ok=True)
     place = _places(out)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
-    replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
+    replace_text(out / "tables.tex", "\n".join(table.latex(look.columns) for table in tables))
     curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
     curves.write_csv(out / "curves.csv")
     environment = jinja2.Environment(
@@ -261,7 +278,7 @@ def write_report(report: Report, out: Path, title: str, formats: Sequence[str] =
         date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         facts=_facts(report),
         texts=_TEXTS,
-        sections=[(s, [(b, _write(b, place, formats)) for b in s.blocks]) for s in report.sections],
+        sections=[(s, [(b, _write(b, place, look)) for b in s.blocks]) for s in report.sections],
     )
     replace_text(out / "report.html", text)
     return out / "report.html"
@@ -280,15 +297,17 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _write(block: Block, place: Callable[[str], Path], formats: Sequence[str]) -> str:
+def _write(block: Block, place: Callable[[str], Path], look: Look) -> str:
     """Write the files of a block; return the PNG of a picture in base64, for the page."""
     if isinstance(block, Table):
         block.write_csv(place(block.name).with_suffix(".csv"))
     if not isinstance(block, Drawing):
         return ""
     path = place(block.name)
-    for form in {*formats, "png"}:
+    for form in {*look.formats, "png"}:
         save_figure(block.figure, path.with_suffix(f".{form}"))
+    if look.panels:
+        figures.save_panels(block.figure, path, look.formats)
     return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 

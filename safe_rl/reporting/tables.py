@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -142,12 +143,22 @@ class Table:
             for row in (self.records if self.shown is None else self.shown)
         ]
 
-    def latex(self) -> str:
-        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit."""
+    def latex(self, columns: Sequence[str] = ()) -> str:
+        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit.
+
+        Args:
+            columns: Titles of the columns to write, without ``$`` and backslashes; empty: all.
+        """
         looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
         cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
         frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
-        sides = "".join("r" if is_number else "l" for is_number in self.numbers)
+        kept = [
+            place
+            for place, title in enumerate(self.columns)
+            if not columns or re.sub(r"[$\\]", "", title) in columns
+        ]
+        frame = frame.iloc[:, kept]
+        sides = "".join("r" if self.numbers[place] else "l" for place in kept)
         text: str = frame.to_latex(index=False, escape=False, column_format=sides)
         return f"% {clean(self.title)}\n{text}"
 

@@ -14,6 +14,7 @@ __all__ = ["TableError", "TableWriter", "read_table"]
 
 # largest size of a table [bytes]; ten thousand epochs with a hundred columns have about 20 million
 MOST_BYTES = 100_000_000
+_MOST_COLUMNS = 10_000
 
 
 class TableError(ValueError):
@@ -113,6 +114,8 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
         TableError: If a row has more or fewer fields than the header, or a field is no number.
     """
     names, *rows = csv.reader(lines) if lines else [[]]
+    if len(names) > _MOST_COLUMNS:
+        raise TableError(f"{path} has {len(names):,} columns, more than any run writes.")
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise TableError(

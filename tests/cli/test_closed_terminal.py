@@ -9,7 +9,7 @@ import sys
 import termios
 
 import pytest
-from commands import ROOT, SMALL
+from commands import ROOT, SMALL, in_a_process
 
 from safe_rl.runs.table import read_table
 
@@ -76,3 +76,17 @@ def test_closed_streams_and_narrow_encodings_end_no_run(tmp_path):
     said = subprocess.run(words, cwd=ROOT, env=ascii_only, capture_output=True, text=True)
     assert "codec can't encode" not in said.stderr
     assert "mean_cost \\u2264" in said.stdout
+
+
+@pytest.mark.long
+def test_a_picture_that_cannot_be_drawn_ends_no_run(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    said = in_a_process(
+        *("train.py", *SMALL, "frames=80", f"hydra.run.dir={tmp_path / 'run'}"),
+        MATPLOTLIBRC=str(tmp_path),
+        PATH=str(tmp_path / "bin"),  # without LaTeX
+    )
+    assert "curves.png was not drawn: " in said
+    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 2

@@ -120,6 +120,13 @@ def test_page_and_latex_say_the_same(report):
     ]
 
 
+def test_the_counts_are_those_of_the_runs(report):
+    words = Page(report / "report.html").words
+    shown = [words[words.index(n) + 1] for n in ("environments", "algorithms", "experiments")]
+    assert shown == ["2", "3", "3"]
+    assert words[words.index("runs") + 1] == "4 of 5 finished"
+
+
 def test_the_page_is_for_everybody(report):
     page = Page(report / "report.html")
     assert all(th.get("scope") in ("col", "row") for th in page.of("th"))
@@ -193,6 +200,18 @@ def test_the_page_holds_everything_itself(report):
     assert "it has not begun" in html
 
 
+def test_slates_that_all_share_are_averaged(tmp_path):
+    for env in ("PointGoal1", "CarGoal1"):
+        for algo in ("ppo", "cpo"):
+            write_run(tmp_path, env, algo)
+    write_run(tmp_path, "DoggoGoal1", "cpo")
+    assert main([str(tmp_path), "seeds=1", f"out={tmp_path / 'there'}"]) == 0
+    page = Page(tmp_path / "there" / "report.html")
+    assert "What all algorithms were trained on" in page.headings
+    assert any("On PointGoal1, CarGoal1." in word for word in page.words)
+    assert (tmp_path / "there" / "slate_shared.csv").exists()
+
+
 def test_algorithms_and_formats_can_be_chosen(folder, tmp_path):
     assert main([str(folder), "algos=ppo,cpo", "formats=svg,pdf", f"out={tmp_path}"]) == 0
     page = Page(tmp_path / "report.html")
@@ -217,6 +236,18 @@ def test_what_cannot_be_done_ends_in_one_line(tmp_path, arguments, message, caps
     assert message in error
 
 
+def test_where_the_page_cannot_be_is_said_before_any_run_is_read(tmp_path, capsys, monkeypatch):
+    write_run(tmp_path)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("safe_rl.cli.report.build_report", None)
+    assert main([str(tmp_path), f"out={tmp_path / 'file'}"]) == 1
+    assert "file is no folder. out=FOLDER writes the report elsewhere." in capsys.readouterr().err
+    monkeypatch.setattr("os.access", lambda path, mode: False)  # root may write anywhere
+    assert main([str(tmp_path)]) == 1
+    error = capsys.readouterr().err
+    assert f"{tmp_path} is read-only. out=FOLDER writes the report elsewhere." in error
+
+
 def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_archived(tmp_path):
     mine, other = tmp_path / "mine", tmp_path / "held_out"
     for root in (mine, other):
@@ -235,9 +266,14 @@ def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_ar
 def test_pictures_and_tables_for_papers(tmp_path):
     for algo in ("cpo", "ppo"):
         write_run(tmp_path, algo=algo, returns=(1.0, 2.0), costs=(3, 4), rates=(0.1, 0.1))
-    assert main([str(tmp_path), "width=4", "formats=pdf"]) == 0
+    words = ["panels=true", "width=4", "formats=pdf", "columns=algorithm,J_r"]
+    assert main([str(tmp_path), *words]) == 0
     out = tmp_path / "report"
+    parts = {path.name for path in out.glob("curves_*.pdf")}
+    assert parts == {"curves_1.pdf", "curves_2.pdf", "curves_3.pdf", "curves_legend.pdf"}
     assert b"/Type3" not in (out / "curves.pdf").read_bytes()
+    first = (out / "tables.tex").read_text().split("midrule")[0]
+    assert "algorithm & $J_r$ \\\\" in first
     curves = pandas.read_csv(out / "curves.csv")
     cost = curves[(curves.algorithm == "CPO") & (curves.quantity == "cost")]
     assert cost[["steps", "mean"]].to_numpy().tolist() == [[1000.0, 3.0], [2000.0, 3.5]]

@@ -2,13 +2,17 @@
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
 from safe_rl.files import CONF
 from safe_rl.reporting.curves import draw_learning_curves
-from safe_rl.reporting.figures import algorithm_styles, compared, draw_fronts
+from safe_rl.reporting.experiments import PACKAGED
+from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts
 from safe_rl.reporting.page import benchmark_figures
 from safe_rl.reporting.scoring import final_table
+from safe_rl.runs.curves import save_figure
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
 
@@ -37,7 +41,7 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     assert panels[2, 0].lines[0].get_linestyle() == ":"
     # where no episode has ended, the cost rate alone gives the name and the steps
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["PPO", "TRPO", "CPO (unfinished)"]
+    assert names == ["PPO", "TRPO (per 1,000 steps)", "CPO (unfinished)"]
     assert panels[1, 0].get_xlim() == panels[1, 2].get_xlim()
 
 
@@ -99,6 +103,41 @@ def test_the_algorithms_of_the_package_are_told_apart(tmp_path):
     assert len({style[:2] for style in styles}) == len({s.colour for s in styles}) == len(names)
 
 
+def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
+    for width in range(15):
+        model = {"model": {"width": width}, "frames": 3000}
+        write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
+        write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
+    experiments = experiments_in(tmp_path)
+    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    lines = figure.axes[0].lines
+    assert len({(line.get_color(), str(line._unscaled_dash_pattern)) for line in lines[::2]}) == 15
+    assert {line.get_linestyle() for line in lines[1::2]} == {":"}
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a", "b", "c"],
+        [f"model.input_scale=a,model.hidden_sizes={n},num_envs={n}" for n in range(12)],
+        [" ".join(f"model.hidden_sizes_{n}=64" for n in range(20))],
+    ],
+)
+def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
+    figure = Figure(figsize=(12, 3), layout="constrained")
+    panels = figure.subplots(1, 3)
+    for name in names:
+        panels[0].plot([0, 1], [0, 1], label=name)
+    add_legend(figure, panels)
+    save_figure(figure, tmp_path / "legend.png")
+    (legend,) = figure.legends
+    box = legend.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert 0 <= box.y0 < box.y1
+    # the figure has grown, so that the panels are as high as with a short legend
+    assert panels[0].get_window_extent().height > 180
+
+
 def fronts(experiments):
     finals = zip(experiments, final_table(experiments).records, strict=True)
     return draw_fronts(compared(finals), algorithm_styles(experiments))
@@ -135,3 +174,13 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     assert len(shown["PointGoal1, 1k steps"].containers) == 2
     labels = shown["PointGoal1, 1k steps"].get_legend_handles_labels()[1]
     assert labels == ["PPO", "CPO"]
+
+
+def test_other_algorithms_have_colours_far_from_the_packages(tmp_path):
+    for algo in ("mine", "yours", "theirs", *sorted(PACKAGED)):
+        write_run(tmp_path, algo=algo)
+    experiments = experiments_in(tmp_path)
+    colours = {e.base: algorithm_styles(experiments)[e.label].colour for e in experiments}
+    ours = np.array([to_rgb(colours[name]) for name in PACKAGED])
+    for name in ("mine", "yours", "theirs"):
+        assert np.linalg.norm(ours - to_rgb(colours[name]), axis=1).min() > 0.35, name

@@ -70,6 +70,29 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
     assert find_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
+def test_what_is_no_run_is_named_with_its_reason(tmp_path):
+    good = write_run(tmp_path)
+    foreign, unbegun, empty, torn, garbled = (
+        write_run(tmp_path, seed=seed, folder=f"f{seed}") for seed in range(1, 6)
+    )
+    (foreign / "config.yaml").write_text("some: thing")
+    (unbegun / "progress.csv").unlink()
+    (empty / "progress.csv").write_text("epoch,steps\n")
+    (torn / "progress.csv").write_text("epoch,steps\n1,1000\n2\n")
+    (garbled / "config.yaml").write_text("{")
+    runs, skipped = find_runs(tmp_path)
+    assert [run.directory for run in runs] == [good]
+    reasons = {path.name: reason for path, reason in skipped.items()}
+    assert (
+        reasons["f1"]
+        == "config.yaml is not that of a run: it lacks a usable env, algo, seed, frames"
+    )
+    assert reasons["f2"] == "it has not begun: no progress.csv"
+    assert reasons["f3"] == "it has not finished an epoch"
+    assert "progress.csv, line 3 has 1 fields" in reasons["f4"]
+    assert reasons["f5"].startswith("config.yaml cannot be read")
+
+
 def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
     with pytest.raises(FileNotFoundError, match="a run is a folder with config"):
         find_runs(tmp_path)
