@@ -77,8 +77,7 @@ class Constraints(Resumable):
         self.keys, self.cost_limits = list(limits), dict(limits)
         self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
         self.tracker, self.risk = tracker, risk
-        has_schedule = tracker is not None and bool(self.keys)
-        self.schedule = tracker.schedule if has_schedule else ""
+        self.schedule = tracker.schedule if tracker is not None and self.keys else ""
         self._max_length = max_length
         # mean costs and length of episodes in the last batch in which an episode finished
         self._finished = torch.full_like(self.limits, torch.nan)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from safe_rl.cli.options import OptionError, run_command
 from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
+from safe_rl.runs.run import Run
 
 if TYPE_CHECKING:
     from safe_rl.evaluation import Evaluation
@@ -23,7 +24,6 @@ def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluat
 def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
     """Evaluate or certify a run, or run it under variations, and print the results."""
     from safe_rl.evaluation.policies import find_run  # with torch: help does not need it
-    from safe_rl.runs.run import Run
 
     directory = find_run(words[0])
     check_imports(Run(directory).config, modules, directory)
@@ -31,8 +31,8 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
     if options.certify:
         return _certify(directory, options)
     if options.variations is not None:
-        varied = evaluate_varied(directory, options, progress=True)
-        print(varied, f"wrote {varied.file}", sep="\n")
+        varied, picture = evaluate_varied(directory, options, progress=True)
+        print(varied, f"wrote {varied.file}", f"wrote {picture}", sep="\n")
     else:
         print(evaluate_run(directory, options, progress=True))
     return 0
@@ -57,12 +57,17 @@ def evaluate_run(
 
 def evaluate_varied(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
-) -> Varied:
-    """Run a policy under ``options.variations``."""
+) -> tuple[Varied, Path]:
+    """Run a policy under ``options.variations``; return the results, and the path of a picture."""
     from safe_rl.evaluation.policies import writable_copy
     from safe_rl.evaluation.variations import evaluate_variations
+    from safe_rl.reporting.figures import draw_variations
 
-    return evaluate_variations(writable_copy(directory), options, progress=progress)
+    directory = writable_copy(directory)
+    varied = evaluate_variations(directory, options, progress=progress)
+    picture = Run(directory).variations_file(options.name, "png")
+    draw_variations(varied.rows, varied.cost_limits, picture)
+    return varied, picture
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:

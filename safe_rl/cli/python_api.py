@@ -360,4 +360,4 @@ class Run(RecordedRun):
             options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
         """
         given = {"checkpoint": self.checkpoint, "variations": variations, **options}
-        return evaluate_varied(self.directory, make_options(given, EvaluationOptions))
+        return evaluate_varied(self.directory, make_options(given, EvaluationOptions))[0]

@@ -273,9 +273,9 @@ def _shape_problems(env: EnvBase) -> Iterator[str]:
     steps = getattr(env, "max_episode_steps", None)
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."
-    kind, base = type(env), ConstrainedEnv
-    stores = isinstance(env, base) and kind.get_state is not base.get_state
-    if stores and kind.set_state in (None, base.set_state):
+    env_class, base = type(env), ConstrainedEnv
+    stores = isinstance(env, base) and env_class.get_state is not base.get_state
+    if stores and env_class.set_state in (None, base.set_state):
         yield "it has 'get_state', so it needs 'set_state' too."
 
 

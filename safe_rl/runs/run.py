@@ -108,9 +108,9 @@ class Run:
         """A file of an evaluation, by its suffix: ``json``, ``csv``, ``mp4``, ``transitions``."""
         return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
 
-    def variations_file(self, name: str) -> Path:
-        """The table of an evaluation under variations."""
-        return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.csv"
+    def variations_file(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation under variations: ``csv`` the table, ``png`` the picture."""
+        return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.{suffix}"
 
     def logger_id_file(self, logger: str) -> Path:
         """The file with the id of this run in a logger's service."""

@@ -53,7 +53,7 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, m
     [
         ([], ["evaluation.json"]),
         (["picture=there.gif"], ["../there.gif"]),
-        (["variations=sensing"], ["variations.csv"]),
+        (["variations=sensing"], ["variations.csv", "variations.png"]),
     ],
 )
 def test_what_cannot_be_written_is_said_before_any_episode(
