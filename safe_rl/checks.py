@@ -132,7 +132,7 @@ def parameters_of(target: Callable[..., Any]) -> dict[str, Parameter]:
     functions = [target]
     if isclass(target):
         functions = [vars(base)["__init__"] for base in target.__mro__ if "__init__" in vars(base)]
-    found: dict[str, Parameter] = {}
+    known: dict[str, Parameter] = {}
     for function in functions:
         parameters = _signature(function).parameters
         for name, parameter in parameters.items():
@@ -140,10 +140,10 @@ def parameters_of(target: Callable[..., Any]) -> dict[str, Parameter]:
                 Parameter.POSITIONAL_OR_KEYWORD,
                 Parameter.KEYWORD_ONLY,
             ):
-                found.setdefault(name, parameter)
+                known.setdefault(name, parameter)
         if all(parameter.kind is not Parameter.VAR_KEYWORD for parameter in parameters.values()):
             break
-    return found
+    return known
 
 
 def _signature(function: Callable[..., Any]) -> Signature:

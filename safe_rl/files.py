@@ -243,9 +243,8 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
         if not path.is_file():
             raise ValueError("there is no such file")
         with ZipFile(path) as archive:
-            if any(
-                one.compress_type or one.file_size > one.compress_size for one in archive.filelist
-            ):
+            parts = archive.filelist
+            if any(p.compress_type or p.file_size > p.compress_size for p in parts):
                 raise ValueError("it has compressed parts, which could fill the memory")
             if not lazy and (part := archive.testzip()) is not None:
                 raise ValueError(f"its part {part} is damaged")

@@ -47,14 +47,14 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
     """
     wanted = _plain(name)
 
-    def rank(found: str) -> tuple[bool, bool, float, bool, bool, int]:
-        there = _plain(found)
+    def rank(candidate: str) -> tuple[bool, bool, float, bool, bool, int]:
+        there = _plain(candidate)
         ratio = round(SequenceMatcher(None, there, wanted).ratio(), 6)
         # ppo_lagrangian begins with PPOLag
         begins = there.replace("_", "").startswith(wanted.replace("_", ""))
         has_beginning = begins and len(name) >= _BEGINNING
         is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
-        length = -abs(len(found) - len(name))
+        length = -abs(len(candidate) - len(name))
         return ratio >= likeness, has_beginning, ratio, is_within, is_mixed, length
 
     best = max(known, key=rank, default=None)

@@ -44,9 +44,9 @@ class Resumable:
             ValueError: If a value is missing, or of another kind or shape than the attribute.
         """
         for name in self.state_names:
-            own = getattr(self, name)
-            value = _restored(name, own, _entry(state_dict, name))
-            if value is not own:
+            current = getattr(self, name)
+            value = _restored(name, current, _entry(state_dict, name))
+            if value is not current:
                 setattr(self, name, value)
 
 
@@ -66,35 +66,34 @@ def _entry(saved: Any, name: str) -> Any:
     return saved[name]
 
 
-def _restored(name: str, own: Any, saved: Any) -> Any:
+def _restored(name: str, current: Any, saved: Any) -> Any:
     """The new value of an attribute: the saved value, or the object after it has loaded it."""
-    if isinstance(own, Tensor):
-        _check_shape(name, own, saved)
-        return saved.to(own, copy=True)
-    if isinstance(own, Mapping):
-        return {
-            key: _restored(f"{name}.{key}", part, _entry(saved, key)) for key, part in own.items()
-        }
-    if isinstance(own, torch.Generator):
-        own.set_state(saved.cpu())
-    elif isinstance(own, torch.optim.Optimizer):
-        load_optimizer(own, saved)
-    elif hasattr(own, "load_state_dict"):
-        own.load_state_dict(saved)
-    elif isinstance(own, int | float | list) and type(saved) is not type(own):
-        raise ValueError(f"'{name}' is {str(saved)[:40]!r}, expected a {type(own).__name__}.")
+    if isinstance(current, Tensor):
+        _check_shape(name, current, saved)
+        return saved.to(current, copy=True)
+    if isinstance(current, Mapping):
+        entries = ((key, part, _entry(saved, key)) for key, part in current.items())
+        return {key: _restored(f"{name}.{key}", part, entry) for key, part, entry in entries}
+    if isinstance(current, torch.Generator):
+        current.set_state(saved.cpu())
+    elif isinstance(current, torch.optim.Optimizer):
+        load_optimizer(current, saved)
+    elif hasattr(current, "load_state_dict"):
+        current.load_state_dict(saved)
+    elif isinstance(current, int | float | list) and type(saved) is not type(current):
+        raise ValueError(f"'{name}' is {str(saved)[:40]!r}, expected a {type(current).__name__}.")
     else:
         return saved
-    return own
+    return current
 
 
-def _check_shape(name: str, own: Tensor, saved: Any) -> None:
+def _check_shape(name: str, current: Tensor, saved: Any) -> None:
     """Refuse what is no tensor of the shape of `own`; where `own` is empty, any length fits."""
     shape = tuple(saved.shape) if isinstance(saved, Tensor) else None
-    lengths = zip(shape or (), own.shape, strict=False)
-    if shape is None or len(shape) != own.ndim or any(n != m and m for n, m in lengths):
-        found = f"a {type(saved).__name__}" if shape is None else f"of the shape {list(shape)}"
-        raise ValueError(f"'{name}' is {found}, expected the shape {list(own.shape)}.")
+    lengths = zip(shape or (), current.shape, strict=False)
+    if shape is None or len(shape) != current.ndim or any(n != m and m for n, m in lengths):
+        kind = f"a {type(saved).__name__}" if shape is None else f"of the shape {list(shape)}"
+        raise ValueError(f"'{name}' is {kind}, expected the shape {list(current.shape)}.")
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state_dict: Any) -> None:

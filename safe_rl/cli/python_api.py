@@ -291,11 +291,11 @@ class Run(RecordedRun):
         lines = [f"Run({str(self.directory)!r}): {self.algorithm} on {self.environment}"]
         if self.num_rows:
             lines.append(self.outcome)
-        if (found := self.certificate) is not None:
-            shown = found["bounds"] if found["certified"] else {}
+        if (certificate := self.certificate) is not None:
+            shown = certificate["bounds"] if certificate["certified"] else {}
             bounds = [f"{name} ≤ {rounded_up(b['bound']):.3g}" for name, b in shown.items()]
-            which = f": {', '.join(bounds)} ({found['checkpoint']})" if bounds else ""
-            level = f"{100 * found['level']:.12g}%"  # not rounded up to 100
+            which = f": {', '.join(bounds)} ({certificate['checkpoint']})" if bounds else ""
+            level = f"{100 * certificate['level']:.12g}%"  # not rounded up to 100
             lines.append(f"{'C' if which else 'Not c'}ertified at {level}{which}.")
         return "\n".join(lines)
 

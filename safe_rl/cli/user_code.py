@@ -79,8 +79,8 @@ def _import(name: str, given: str) -> str:
             ) from None
         frames = traceback.extract_tb(error.__traceback__)
         # the user's own line, not the line of this package that refuses its arguments
-        own = [frame for frame in frames if not _is_inner(frame.filename)]
-        place = f" ({own[-1].filename}, line {own[-1].lineno})" if own else ""
+        users = [frame for frame in frames if not _is_inner(frame.filename)]
+        place = f" ({users[-1].filename}, line {users[-1].lineno})" if users else ""
         raise ValueError(f"import={given}: {type(error).__name__}: {error}{place}.") from error
 
 

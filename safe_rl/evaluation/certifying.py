@@ -182,8 +182,8 @@ def _candidates(run: Run) -> list[Path]:
     An exported policy has none of these kinds, only its certified one.
     """
     kinds = (run.checkpoints(kind) for kind in ("best", "last"))
-    found = {path.name: path for paths in kinds for path in paths}
-    return [found[name] for name in sorted(found)] or run.checkpoints("certified")
+    by_name = {path.name: path for paths in kinds for path in paths}
+    return [by_name[name] for name in sorted(by_name)] or run.checkpoints("certified")
 
 
 def _has_warp(evaluation: PolicyEvaluation) -> bool:

@@ -215,8 +215,8 @@ def periodic_evaluation(
             closing(make_env(num_envs=worlds, seed=seed if fixed_layout else fresh)) as env,
         ):
             torch.manual_seed(fresh)
-            found = collect_episodes(env, policy, episodes, cost_keys, deterministic=True)
-        means = (values.mean().item() for values in (found.returns, *found.costs.values()))
+            collected = collect_episodes(env, policy, episodes, cost_keys, deterministic=True)
+        means = (values.mean().item() for values in (collected.returns, *collected.costs.values()))
         return dict(zip(names, means, strict=True))
 
     return evaluate

@@ -216,14 +216,15 @@ def describe(directory: Path, checkpoint: Path, *, sampled: bool) -> dict[str, A
         sampled: Whether its actions are sampled when it is used.
     """
     run = Run(directory)
-    found = run.certificate_of(checkpoint)
-    covers = found is not None and is_sampled(found) == sampled
+    certificate = run.certificate_of(checkpoint)
+    if certificate is not None and is_sampled(certificate) != sampled:
+        certificate = None
     kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
     return {
         "algorithm": run.algorithm,
         "steps": checkpoint_steps(checkpoint),
         "commit": run.code[-1]["commit"] if run.code else None,
-        "certificate": {key: found.get(key) for key in kept} if found and covers else None,
+        "certificate": certificate and {key: certificate.get(key) for key in kept},
     }
 
 

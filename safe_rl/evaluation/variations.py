@@ -65,7 +65,7 @@ def read_variations(given: Any) -> list[Variation]:
         >>> len(read_variations(["sensing", {"heavy": {"env.mass_scale": 2.0}}]))
         9
     """
-    found: list[Variation] = []
+    variations: list[Variation] = []
     if given == []:
         raise ValueError("variations=[]: it must name at least one set, file or row.")
     for part in given if isinstance(given, list) else [given]:
@@ -78,10 +78,10 @@ def read_variations(given: Any) -> list[Variation]:
                 raise ValueError(f"variations={part}: {error}") from error
         if not isinstance(rows, Mapping) or not rows:
             raise ValueError(f"variations={part}: it must have rows, as conf/variations.yaml has.")
-        found += [
+        variations += [
             v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])
         ]
-    return found
+    return variations
 
 
 def _set_of(name: str) -> Mapping[str, Any]:
@@ -146,11 +146,11 @@ def varied(config: DictConfig, variation: Variation) -> DictConfig | None:
         elif name not in changed.transforms:
             changed.transforms[name] = _transform(name)
         if isinstance(value, str) and value.startswith(_FACTOR):
-            own = OmegaConf.select(changed, key)
-            if not isinstance(own, int | float):
+            trained_value = OmegaConf.select(changed, key)
+            if not isinstance(trained_value, int | float):
                 raise ValueError(f"{key}={value}: this environment has no number '{key}'.")
-            product = float(value.removeprefix(_FACTOR)) * own
-            value = round(product) if isinstance(own, int) else product
+            product = float(value.removeprefix(_FACTOR)) * trained_value
+            value = round(product) if isinstance(trained_value, int) else product
         OmegaConf.update(changed, key, value, merge=False, force_add=True)
     is_same = _present(OmegaConf.to_container(changed)) == _present(before)
     return None if is_same else changed

@@ -169,7 +169,7 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], rate: float) -> N
     pictures = [Image.fromarray(frame) for frame in frames]
     if path.suffix == ".gif":
         # one palette for all frames, and no dither, so that static parts are stored only once
-        few = np.concatenate([np.asarray(one) for one in pictures[:: len(pictures) // 8 + 1]])
+        few = np.concatenate([np.asarray(p) for p in pictures[:: len(pictures) // 8 + 1]])
         palette = Image.fromarray(few).quantize(64)
         pictures = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     durations = [round(1000 / rate)] * (len(pictures) - 1) + [1500]  # the last one stays [ms]

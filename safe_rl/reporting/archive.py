@@ -56,11 +56,11 @@ class Run(folders.Run):
         table: Mapping[str, list[float]],
         notes: Mapping[str, Any],
     ) -> None:
-        own = {name: notes.get(name) for name in ("certificate", "evaluations", "code")}
-        super().__init__(directory, settings=settings, table=table, **own)
+        notes_of_run = {name: notes.get(name) for name in ("certificate", "evaluations", "code")}
+        super().__init__(directory, settings=settings, table=table, **notes_of_run)
         self.notes = notes
-        said = notes.get("overrides")
-        self.overrides = list(map(clean, said)) if isinstance(said, list) else None
+        overrides = notes.get("overrides")
+        self.overrides = list(map(clean, overrides)) if isinstance(overrides, list) else None
 
     def check(self) -> None:
         """Refuse a run that lacks what a report needs.
@@ -111,7 +111,7 @@ class Run(folders.Run):
     @cached_property
     def evaluation_records(self) -> list[dict[str, Any]]:
         """Its evaluations, each as a record, see `read_evaluation`."""
-        return [read_evaluation(found) for found in self.notes.get("evaluations", ())]
+        return [read_evaluation(evaluation) for evaluation in self.notes.get("evaluations", ())]
 
     @cached_property
     def certificate_record(self) -> dict[str, Any] | None:
@@ -139,16 +139,16 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     """
     if not root.is_dir():
         raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
-    found: list[Run] = []
+    candidates: list[Run] = []
     skipped: dict[Path, str] = {}
     for path in paths_below(root, RUNS):
         with _noted(path, skipped):
-            found += read_archive(path.parent).values()
+            candidates += read_archive(path.parent).values()
     for folder in folders.find_runs(root):
         with _noted(folder.directory, skipped):
-            found.append(_read_run(folder, skipped))
+            candidates.append(_read_run(folder, skipped))
     runs = []
-    for run in found:
+    for run in candidates:
         with _noted(run.directory, skipped):
             run.check()
             run.takes_part = unfinished
@@ -197,9 +197,9 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
         "certificate": read(folder.certificate_file, read_certificate),
         "code": read(folder.code_file, read_code),
         "evaluations": [
-            {key: value for key, value in found.items() if key not in ("run", "checkpoint_file")}
+            {k: v for k, v in evaluation.items() if k not in ("run", "checkpoint_file")}
             for path in folder.evaluation_files
-            if (found := read(path, read_evaluation))
+            if (evaluation := read(path, read_evaluation))
         ]
         or None,
     }
@@ -223,10 +223,10 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     for name in kept.keys() & names:
         differing = differences(kept[name].settings, names[name].settings)
         # what `resume=` may change makes no other run
-        if found := [key for key in differing if not role_of(key).may_change]:
+        if changed := [key for key in differing if not role_of(key).may_change]:
             raise ValueError(
                 f"archive={archive}: its run {name} is another one than that in {root}: they "
-                f"differ in {', '.join(found)}. Give another folder for these runs."
+                f"differ in {', '.join(changed)}. Give another folder for these runs."
             )
         longest, steps = max(kept[name].table.get("steps", [0])), names[name].steps
         if longest > steps:
@@ -280,8 +280,8 @@ def _tables(path: Path) -> Iterator[tuple[str, dict[str, list[float]]]]:
     text = io.BytesIO(read_bounded(path, _MOST_BYTES, packed=True))
     rows = pandas.read_csv(text, dtype=kinds, keep_default_na=False, na_values=[""])
     for name, table in rows.groupby("run", sort=False):
-        own = table.drop(columns="run")
-        known = own.columns[own.notna().any()]
+        frame = table.drop(columns="run")
+        known = frame.columns[frame.notna().any()]
         # before its first episode has ended, a run has no number in the first two
         kept = ["episode_return", *(f"episode_{c.removesuffix('_rate')}" for c in known), *known]
-        yield name, own.loc[:, own.columns.isin(kept)].to_dict("list")
+        yield name, frame.loc[:, frame.columns.isin(kept)].to_dict("list")

@@ -84,7 +84,7 @@ def draw_learning_curves(
     groups: dict[tuple[str, int], list[Experiment]] = {}
     for e in experiments:
         groups.setdefault((e.environment, e.planned_steps), []).append(e)
-    rows = [(*group, key) for group, own in groups.items() for key in drawn_keys(own)]
+    rows = [(*group, key) for group, members in groups.items() for key in drawn_keys(members)]
     figure = Figure(figsize=(width, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
     panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
     several = len({name for name, _ in groups}) < len(groups)
@@ -124,8 +124,8 @@ def comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -
     ]
     cells = Counter(s for _, _, s in {(e.benchmark, e.base, e.planned_steps) for e in known})
     steps = max(cells, key=lambda steps: (cells[steps], steps), default=0)
-    own = sorted((e for e in known if e.planned_steps == steps), key=lambda e: len(e.runs))
-    return [*{(e.benchmark, e.base): e for e in own}.values()]
+    by_seeds = sorted((e for e in known if e.planned_steps == steps), key=lambda e: len(e.runs))
+    return [*{(e.benchmark, e.base): e for e in by_seeds}.values()]
 
 
 def draw_benchmark(

@@ -134,14 +134,14 @@ def group_runs(
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         environment, title = environments[run.directory], _title(run, labels or {})
         benchmark = suite.name_of(run.settings["env"])
-        own = Experiment(environment, title, settings[run.directory], benchmark, (run,))
-        cell = cells[environment, own.algorithm]
+        experiment = Experiment(environment, title, settings[run.directory], benchmark, (run,))
+        cell = cells[environment, experiment.algorithm]
         if run.seed in cell:
             repeated = cell[run.seed].runs[0].directory
             skipped[repeated] = f"{run.directory} is the same run with the same seed"
-        cell[run.seed] = own
+        cell[run.seed] = experiment
     ordered = [[cell[seed] for seed in sorted(cell)] for cell in cells.values()]
-    experiments = [replace(own[0], runs=tuple(e.runs[0] for e in own)) for own in ordered]
+    experiments = [replace(seeds[0], runs=tuple(e.runs[0] for e in seeds)) for seeds in ordered]
     return sorted(experiments, key=_order), skipped
 
 
@@ -184,19 +184,19 @@ def _settings_of_names(
     These are settings that differ between runs of the algorithm, and that a user has set. If they
     do not distinguish all experiments on an environment, all settings that differ are used there.
     """
-    found: dict[Path, Settings] = {}
+    named: dict[Path, Settings] = {}
     by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         by_algorithm[run.algorithm][environments[run.directory]].append(run)
     for cells in by_algorithm.values():
-        settings = {run.directory: _settings(run) for own in cells.values() for run in own}
+        settings = {run.directory: _settings(run) for cell in cells.values() for run in cell}
         # an experiment may train longer on one environment than on another
-        anywhere = [{**own, "frames": None} for own in settings.values()]
-        by_cell = [[settings[run.directory] for run in own] for own in cells.values()]
+        anywhere = [{**of_run, "frames": None} for of_run in settings.values()]
+        by_cell = [[settings[run.directory] for run in cell] for cell in cells.values()]
         keys = distinguishing_keys([*by_cell, anywhere])
-        for own in cells.values():
+        for cell in cells.values():
             alike: dict[tuple[tuple[str, Hashable], ...], list[Run]] = defaultdict(list)
-            for run in own:
+            for run in cell:
                 of_run = settings[run.directory]
                 known = tuple((key, of_run[key]) for key in keys if of_run.get(key) is not None)
                 alike[known].append(run)
@@ -206,15 +206,15 @@ def _settings_of_names(
             }
             for known, members in alike.items():
                 name = names[known] if len(set(names.values())) == len(names) else known
-                found |= {run.directory: dict(name) for run in members}
-    return found
+                named |= {run.directory: dict(name) for run in members}
+    return named
 
 
 def _is_given(key: str, run: Run) -> bool:
     """Whether a user has set a key, or chosen the group that it belongs to."""
-    said = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
+    keys = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
     return key.partition(".")[0] in _ALWAYS_NAMED or any(
-        key == one or key.startswith(f"{one.partition('@')[0]}.") for one in said
+        key == given or key.startswith(f"{given.partition('@')[0]}.") for given in keys
     )
 
 

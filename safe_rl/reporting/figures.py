@@ -126,7 +126,7 @@ def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
             steps = dict.fromkeys((record["fewest_steps"], record["steps"]))
             key = (experiment.environment, " to ".join(map(short_number, steps)))
             groups[key].append((experiment, record))
-    return {f"{e}, {n} steps": own for (e, n), own in groups.items() if len(own) > 1}
+    return {f"{e}, {n} steps": members for (e, n), members in groups.items() if len(members) > 1}
 
 
 def draw_fronts(
@@ -142,8 +142,8 @@ def draw_fronts(
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(width, 3.3 * rows + 0.2), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for number, (axis, (title, own)) in enumerate(zip(panels, groups.items(), strict=False)):
-        _draw_front(axis, own, styles)
+    for number, (axis, (title, finals)) in enumerate(zip(panels, groups.items(), strict=False)):
+        _draw_front(axis, finals, styles)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
         axis.set_xlabel("episode cost")
         axis.set_ylabel("return" if number % columns == 0 else "")
@@ -161,17 +161,17 @@ def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]
     families: dict[str, list[Final]] = defaultdict(list)
     for experiment, record in finals:
         families[experiment.family].append((experiment, record))
-    for family, own in families.items():
-        own.sort(key=lambda pair: pair[0].limits.get("cost", math.inf))
-        style = styles[own[0][0].label]
-        joined = np.array([(r["episode_cost"], r["episode_return"]) for _, r in own]).T
+    for family, members in families.items():
+        members.sort(key=lambda pair: pair[0].limits.get("cost", math.inf))
+        style = styles[members[0][0].label]
+        joined = np.array([(r["episode_cost"], r["episode_return"]) for _, r in members]).T
         axis.plot(*joined, color=style.colour, linewidth=1, alpha=0.6)
-        for (experiment, record), cost, value in zip(own, *joined, strict=True):
+        for (experiment, record), cost, value in zip(members, *joined, strict=True):
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
                 **style.point, linestyle="", elinewidth=0.8, markersize=7, label=literal(family),
             )  # fmt: skip
-            if len(own) > 1 and "cost" in experiment.limits:
+            if len(members) > 1 and "cost" in experiment.limits:
                 text = f"≤ {experiment.limits['cost']:g}"
                 axis.annotate(
                     text, (cost, value), (5, 4), textcoords="offset points", fontsize=7, color="0.3"

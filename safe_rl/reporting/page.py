@@ -171,17 +171,17 @@ def build_report(
 
 def _baselines(places: Sequence[Path], environments: Collection[str]) -> list[Run]:
     """Finished runs of other folders in some environments, with the names of their folders."""
-    found = []
+    runs = []
     for place in places:
         for run in find_runs(place)[0]:
             if run.environment in environments and run.is_finished:
                 run.source = clean(place.resolve().name, 40)
-                found.append(run)
-    return found
+                runs.append(run)
+    return runs
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:
-    return [list(own) for _, own in groupby(experiments, key=lambda e: e.environment)]
+    return [list(members) for _, members in groupby(experiments, key=lambda e: e.environment)]
 
 
 def _fronts(
@@ -190,7 +190,7 @@ def _fronts(
     panels = figures.compared(zip(chain(*groups), chain(*(t.records for t in finals)), strict=True))
     if not panels:
         return []
-    texts = [f"{what}: {', '.join(e.algorithm for e, _ in own)}" for what, own in panels.items()]
+    texts = [f"{what}: {', '.join(e.algorithm for e, _ in m)}" for what, m in panels.items()]
     says = f"Final return against final episode cost. {'; '.join(texts)}"
     return [Drawing("fronts", "", figures.draw_fronts(panels, styles, width), says)]
 
@@ -201,20 +201,20 @@ def benchmark_figures(experiments: Sequence[Experiment], width: float) -> list[D
     Environments without runs are shown as missing.
     """
     robots = {"Point": 7, "Car": 8, "Doggo": 9}
-    found = {robot: comparable(experiments, SLATES[f"SG{robot}"]) for robot in robots}
-    if len({e.benchmark for own in found.values() for e in own}) < _FEWEST_ENVIRONMENTS:
+    by_robot = {robot: comparable(experiments, SLATES[f"SG{robot}"]) for robot in robots}
+    if len({e.benchmark for members in by_robot.values() for e in members}) < _FEWEST_ENVIRONMENTS:
         return []
     return [
         Drawing(
             f"figure_{robots[robot]}",
             f"The paper's Figure {robots[robot]}, from runs of "
-            f"{short_number(own[0].planned_steps)} steps",
-            draw_benchmark(own, SLATES[f"SG{robot}"], width),
+            f"{short_number(members[0].planned_steps)} steps",
+            draw_benchmark(members, SLATES[f"SG{robot}"], width),
             "Return, episode cost and cost rate of the paper's algorithms, a column for each of "
             f"{robot}'s environments",
         )
-        for robot, own in found.items()
-        if own
+        for robot, members in by_robot.items()
+        if members
     ]
 
 

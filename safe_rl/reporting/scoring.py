@@ -60,8 +60,8 @@ def _critic_bias(run: Run) -> dict[str, float]:
 def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Mean and standard deviation of figures over the seeds that have them."""
     record = {}
-    for name in dict.fromkeys(name for one in values for name in one):
-        known = np.array([one[name] for one in values if name in one])
+    for name in dict.fromkeys(name for of_seed in values for name in of_seed):
+        known = np.array([of_seed[name] for of_seed in values if name in of_seed])
         record[name] = float(known.mean())
         record[f"{name}_std"] = float(known.std(ddof=1)) if known.size > 1 else math.nan
     return record
@@ -264,7 +264,7 @@ def duration(hours: float) -> str:
 def evaluation_table(experiments: Sequence[Experiment]) -> Table:
     """The results of ``safe-rl evaluate`` of all runs."""
     runs = _each_run(experiments)
-    records = [{**where, **found} for where, run in runs for found in run.evaluation_records]
+    records = [{**where, **record} for where, run in runs for record in run.evaluation_records]
     others = {(e.environment, e.algorithm): e.limits_of_other_measures for e in experiments}
     total = ["cost"] if any("episode_cost" in record for record in records) else []
     keys = list(dict.fromkeys([*total, *_names(records, "limit_")]))

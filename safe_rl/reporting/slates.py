@@ -27,20 +27,21 @@ def complete_slates(
     environment its experiments, one per environment, with a limit on ``cost``. Runs that started
     from another run's networks do not count.
     """
-    own: dict[str, dict[str, Experiment]] = {}
+    by_algorithm: dict[str, dict[str, Experiment]] = {}
     for e in experiments:
         if e.benchmark in benchmark.REFERENCE and not e.is_continued:
-            found = own.setdefault(e.algorithm, {})
+            cell = by_algorithm.setdefault(e.algorithm, {})
             if "cost" in e.limits and e.finished:
-                found[str(e.benchmark)] = e
-    shared = tuple(n for n in benchmark.REFERENCE if all(n in found for found in own.values()))
+                cell[str(e.benchmark)] = e
+    cells = by_algorithm.values()
+    shared = tuple(name for name in benchmark.REFERENCE if all(name in cell for cell in cells))
     slates = {name: (slate, needed) for name, slate in benchmark.SLATES.items()}
     shown = []
     for name, (slate, least) in {**slates, "shared": (shared, 1)}.items():
         members = [
-            [found[env] for env in slate]
-            for found in own.values()
-            if all(env in found and len(found[env].finished) >= least for env in slate)
+            [cell[env] for env in slate]
+            for cell in cells
+            if all(env in cell and len(cell[env].finished) >= least for env in slate)
         ]
         if slate and members and slate not in shown:
             shown.append(slate)
@@ -122,16 +123,16 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
     it has finished runs. An algorithm dominates another one on the same environments if both keep
     the constraint and it has no lower return and no higher cost rate, and one of them is better.
     """
-    own: dict[str, list[Experiment]] = {}
+    by_algorithm: dict[str, list[Experiment]] = {}
     for e in experiments:
         is_ours = e.base in benchmark.ALGORITHMS and not e.is_continued and "cost" in e.limits
         if is_ours and e.reference is not None and e.finished:
-            own.setdefault(e.algorithm, []).append(e)
+            by_algorithm.setdefault(e.algorithm, []).append(e)
     records: list[dict[str, Any]] = []
     for slate in ("SG18", "SG12", "SG6", "SG1", "SG2", "SGPoint", "SGCar", "SGDoggo"):
         names = benchmark.SLATES[slate]
-        for found in own.values():
-            members = [e for e in found if e.benchmark in names]
+        for candidates in by_algorithm.values():
+            members = [e for e in candidates if e.benchmark in names]
             if members:
                 there = {str(e.benchmark) for e in members}
                 records.append({**_record(slate, members), "there": there, "all": len(names)})
@@ -156,8 +157,8 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
 
 
 def _dominating(record: Record, records: Sequence[Record]) -> list[str]:
-    def figures(one: Record) -> tuple[float, float]:
-        return one["episode_return"], -one["cost_rate"]
+    def figures(scores: Record) -> tuple[float, float]:
+        return scores["episode_return"], -scores["cost_rate"]
 
     return [
         other["algorithm"]

@@ -65,8 +65,8 @@ def filled(template: str, record: Record) -> str:
     for part in template.split("|"):
         names = [name for _, name, _, _ in Formatter().parse(part) if name]
         texts.append(None if any(_is_missing(record.get(n)) for n in names) else part)
-    found = "".join(text.format(**record) for text in texts if text is not None)
-    return "—" if texts[0] is None else found
+    joined = "".join(text.format(**record) for text in texts if text is not None)
+    return "—" if texts[0] is None else joined
 
 
 def _is_missing(value: Any) -> bool:
@@ -84,12 +84,12 @@ def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> 
     """
     rows: list[Record] = []
     for record in records:
-        own: list[Record] = []
+        of_record: list[Record] = []
         for key in keys:
             places = {name: place.format(key) for name, place in fields.items()}
-            if found := {name: record[p] for name, p in places.items() if p in record}:
-                own.append({**record, "key": key, "cost": clean(key, 40), **found})
-        rows += own or [record]
+            if figures := {name: record[p] for name, p in places.items() if p in record}:
+                of_record.append({**record, "key": key, "cost": clean(key, 40), **figures})
+        rows += of_record or [record]
     return rows
 
 
@@ -185,8 +185,8 @@ def mark_best(
     """
 
     def mark(record: Record) -> str:
-        own = rivals[record["algorithm"]]
-        group = [other for other in records if rivals[other["algorithm"]] == own]
+        peers = rivals[record["algorithm"]]
+        group = [other for other in records if rivals[other["algorithm"]] == peers]
         if len(group) < 2 or name not in record or not is_able(record):
             return ""
         known = [r[name] for r in group if is_able(r) and not _is_missing(r.get(name))]

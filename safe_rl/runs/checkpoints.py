@@ -68,13 +68,13 @@ def policy_hash(path: Path) -> str:
 
 def flatten_tensors(state: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
     """All tensors of nested dictionaries by dotted names."""
-    found: dict[str, Tensor] = {}
+    tensors: dict[str, Tensor] = {}
     for name, value in state.items():
         if isinstance(value, Mapping):
-            found |= flatten_tensors(value, f"{prefix}{name}.")
+            tensors |= flatten_tensors(value, f"{prefix}{name}.")
         elif isinstance(value, Tensor):
-            found[f"{prefix}{name}"] = value
-    return found
+            tensors[f"{prefix}{name}"] = value
+    return tensors
 
 
 def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
@@ -119,8 +119,8 @@ def best_checkpoint(directory: Path) -> Path | None:
 
     One that cannot be read counts as the best, so that no other one silently takes its place.
     """
-    found = checkpoints_in(directory)
-    return max(found, key=lambda path: (_score(path, otherwise=math.inf), path.name), default=None)
+    ranked = sorted(checkpoints_in(directory), key=lambda p: (_score(p, math.inf), p.name))
+    return ranked[-1] if ranked else None
 
 
 def _score(path: Path, otherwise: float = -math.inf) -> float:

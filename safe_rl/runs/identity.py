@@ -207,8 +207,8 @@ def check_same_run(run: Run, config: DictConfig) -> None:
         ValueError: If other settings differ; the message names every key.
     """
     given = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    if found := differences(run.settings, given):
-        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in found.items())
+    if changed := differences(run.settings, given):
+        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in changed.items())
         raise ValueError(
             f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
             "the sweep another folder with hydra.sweep.dir=..."

@@ -100,9 +100,7 @@ class Claim:
 
     def statements(self, costs: Costs) -> list[Statement]:
         """All statements that have to be shown, with their values for some episodes, [E] each."""
-        return [
-            one for key in self.limits for one in self._about(key, np.asarray(costs[key], float))
-        ]
+        return [s for key in self.limits for s in self._about(key, np.asarray(costs[key], float))]
 
     def _about(self, key: str, costs: np.ndarray) -> Iterator[Statement]:
         limit, highest = self.limits[key], self.highest.get(key, math.inf)
@@ -136,8 +134,7 @@ class Claim:
             tests: Largest number of policies tested; they share the error (Bonferroni).
         """
         level = self._level(tests)
-        found = self.statements(costs)
-        return {one.name: (one.bound(level, self.bound), one.limit) for one in found}
+        return {s.name: (s.bound(level, self.bound), s.limit) for s in self.statements(costs)}
 
     def shortfalls(self, costs: Costs, tests: int) -> dict[str, float]:
         """By how much bounds exceed their limits; empty if the claim is certified."""
@@ -153,7 +150,7 @@ class Claim:
             return 2
         level = self._level(tests)
         nothing = {key: np.zeros(1) for key in self.limits}
-        return max((one.fewest(level) for one in self.statements(nothing)), default=1)
+        return max((statement.fewest(level) for statement in self.statements(nothing)), default=1)
 
     def may_end(self, costs: Costs, tests: int, most: int) -> bool:
         """Whether a test of up to ``most`` episodes may end early.
@@ -163,11 +160,11 @@ class Claim:
         """
         if self.bound != "betting":
             return False
-        level, found = self._level(tests), self.statements(costs)
-        if all(one.is_shown(level) for one in found):
+        level, statements = self._level(tests), self.statements(costs)
+        if all(statement.is_shown(level) for statement in statements):
             return True
-        is_long = 5 * min((len(one.values) for one in found), default=0) >= most
-        return is_long and any(one.is_hopeless(level, most) for one in found)
+        is_long = 5 * min((len(statement.values) for statement in statements), default=0) >= most
+        return is_long and any(statement.is_hopeless(level, most) for statement in statements)
 
     def _level(self, tests: int) -> float:
         return 1 - (1 - self.level) / max(1, tests)
@@ -220,7 +217,7 @@ def rank(
     def key(candidate: int) -> tuple[bool, float]:
         claim = claims[candidate]
         statements = claim.statements(costs[candidate])
-        excess = max((_expected_excess(one, claim.level) for one in statements), default=0.0)
+        excess = max((_expected_excess(s, claim.level) for s in statements), default=0.0)
         loss = -float(np.asarray(returns[candidate], dtype=float).mean())
         return excess > 0, excess if excess > 0 else _or_infinite(loss)
 
@@ -276,7 +273,7 @@ def first_certified(
         if verdict.certified is not None:
             return verdicts[-1]
     # by how much the worst bound of each candidate exceeds its limit, in the units of `rank`
-    excess = [max((b - d) / max(d, 1.0) for b, d in one.bounds.values()) for one in verdicts]
+    excess = [max((b - d) / max(d, 1.0) for b, d in v.bounds.values()) for v in verdicts]
     return verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, tested)
 
 
@@ -298,7 +295,7 @@ def _test(
         tested=[],
         bounds=bounds,
         shortfalls=missing,
-        by_construction=[one.name for one in statements if one.is_by_construction],
+        by_construction=[s.name for s in statements if s.is_by_construction],
         highest=dict(claim.highest),
         episodes=number,
     )

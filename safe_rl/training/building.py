@@ -185,11 +185,11 @@ def estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _check_shapes(
-    name: str, own: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
+    name: str, network: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
 ) -> None:
     here, there = (
         {key: tuple(value.shape) for key, value in weights.items() if isinstance(value, Tensor)}
-        for weights in (own, given)
+        for weights in (network, given)
     )
     if other := next((key for key in here | there if here.get(key) != there.get(key)), None):
         raise CheckpointError(
