@@ -12,7 +12,6 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from safe_rl.checks import is_number
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitState, LimitTracker
@@ -96,10 +95,10 @@ class Constraints(Resumable):
             env: Environment that has the costs.
 
         Raises:
-            ValueError: If a limit names no cost of the environment, a constrained algorithm has no
-                limit, or a risk measure is named without a tracker.
+            ValueError: If a constrained algorithm has no limit, or a risk measure is named without
+                a tracker.
         """
-        limits = check_cost_limits(config.cost_limits, env.cost_keys)
+        limits = {key: float(limit) for key, limit in config.cost_limits.items()}
         if config.algo.constrained and not limits:
             raise ValueError(
                 f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
@@ -235,7 +234,7 @@ def check_cost_limits(
     """Check that the environment has every key, and return the limits as a plain dictionary.
 
     Raises:
-        ValueError: If a key is unknown, or a limit is negative, infinite or not a number.
+        ValueError: If a key is unknown.
     """
     limits: dict[str, float] = {}
     for key, limit in cost_limits.items():
@@ -244,11 +243,6 @@ def check_cost_limits(
                 f"cost_limits names '{key}', but this environment has no such cost."
                 f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}; in Safety "
                 "Gym's environments env.constrain_<kind>=true adds those of another kind."
-            )
-        if not is_number(limit) or limit < 0:
-            raise ValueError(
-                f"The limit of '{key}' is {limit!r}: it must be a number of at least 0, the "
-                "undiscounted cost allowed per episode. Leave out a cost that has no limit."
             )
         limits[key] = float(limit)
     return limits

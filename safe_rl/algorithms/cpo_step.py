@@ -11,7 +11,8 @@ from pydantic import PositiveFloat
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
+from safe_rl.algorithms.losses import finite_sum
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.trust_region import flat_gradient
 
@@ -93,11 +94,11 @@ class CPOStep(TRPOStep):
         losses: TensorDictBase, c: Tensor, may_be_worse: Tensor
     ) -> Callable[[TensorDictBase, Tensor], bool]:
         """Criterion: costs rise by max(−c, 0) at most, and the loss only if `may_be_worse`."""
-        before, cost_before = total_loss(losses).detach(), losses["cost_surrogate"].detach()
+        before, cost_before = finite_sum(losses).detach(), losses["cost_surrogate"].detach()
         allowance = (-c).clamp_min(0)
 
         def is_acceptable(after: TensorDictBase, kl: Tensor) -> bool:
-            not_worse = total_loss(after) <= before
+            not_worse = finite_sum(after) <= before
             within = (after["cost_surrogate"] - cost_before <= allowance).all()
             return bool((not_worse | may_be_worse) & within)
 
@@ -108,7 +109,7 @@ class CPOStep(TRPOStep):
         c = problem.required_decrease
         if self.rescale_violation:
             c = (c / problem.length).nan_to_num(nan=0.0)
-        loss = total_loss(problem.losses)
+        loss = finite_sum(problem.losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         return g, self._gradients(problem.surrogates), c
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import EnvBase
 
-from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.collectors import (
     check_steps,
@@ -64,10 +63,9 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             f"{needed:,} (exploration.random_steps, memory.n_steps)."
         )
         return warning if frames < needed else "", True
-    limits = check_cost_limits(config.cost_limits, env.cost_keys)
     steps, interface = read_dataset(node.path), read_columns(node.path)
     try:
-        learns_from = _fill(buffer, steps, interface, node, limits, env)
+        learns_from = _fill(buffer, steps, interface, node, config.cost_limits, env)
     except (ValueError, FloatingPointError) as error:
         raise ValueError(f"dataset.path={node.path}: {error}") from error
     return learns_from + _other_environment(config), not node.alone

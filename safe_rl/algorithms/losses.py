@@ -52,6 +52,13 @@ def sum_of_losses(losses: TensorDictBase) -> Tensor:
     return torch.stack([value.reshape(()) for value in terms.values()]).sum()
 
 
+def finite_sum(losses: TensorDictBase) -> Tensor:
+    """`sum_of_losses` of a step that is not taken if it is not finite: `divergence`."""
+    if not (total := sum_of_losses(losses)).isfinite():
+        raise divergence(losses)
+    return total
+
+
 def divergence(
     losses: TensorDictBase, outcome: str = "This step is not taken."
 ) -> FloatingPointError:

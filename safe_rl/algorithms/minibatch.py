@@ -26,7 +26,7 @@ from safe_rl.checks import Share, Weight, checked
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.policy_projections import CUPLoss
-from safe_rl.objectives.samples import learning_samples, mask_keys, require_finite
+from safe_rl.objectives.samples import learning_samples, mask_keys
 from safe_rl.objectives.surrogate import SurrogateLoss
 
 
@@ -203,9 +203,7 @@ class MinibatchUpdate(PolicyUpdate):
         selected = batch.select(*self.loss.in_keys)
         others = [*mask_keys(self.loss), *estimates_read(self.loss)]
         selected.update(batch.select(*others, strict=False))
-        samples = learning_samples(selected, self.loss.in_keys, self.loss)
-        require_finite(samples, self.loss.in_keys)
-        return samples
+        return learning_samples(selected, self.loss.in_keys, self.loss)
 
     def _next_rate(self, share_of_steps: float, kl: Tensor) -> Tensor:
         """Adapt the learning rate after an update, if it took a step, and return the rate."""

@@ -9,7 +9,8 @@ from pydantic import NonNegativeFloat
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep, total_loss
+from safe_rl.algorithms.losses import finite_sum
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep
 from safe_rl.checks import Fraction
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
 from safe_rl.objectives.trust_region import flat_gradient
@@ -113,7 +114,7 @@ class CTRPOStep(TRPOStep):
         slack, start = -violation[inside], length * surrogates[inside].detach()
         worst = int(violation.masked_fill(~self.recovering, -torch.inf).argmax())
         recovers = self.recovering.any()
-        objective = (lambda of: of["cost_surrogate"][worst]) if recovers else total_loss
+        objective = (lambda of: of["cost_surrogate"][worst]) if recovers else finite_sum
         loss = objective(problem.losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         b = self._gradients(surrogates[inside])

@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
-from safe_rl.algorithms.losses import sum_of_losses
+from safe_rl.algorithms.losses import finite_sum
 from safe_rl.checks import Fraction
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.limits import LimitState
-from safe_rl.objectives.samples import learning_samples, require_finite
+from safe_rl.objectives.samples import learning_samples
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trust_region import (
     FisherProduct,
@@ -88,21 +88,6 @@ class Proposal(NamedTuple):
     step: Tensor
     is_acceptable: Callable[[TensorDictBase, Tensor], bool]
     diagnostics: dict[str, Tensor]
-
-
-def total_loss(losses: TensorDictBase) -> Tensor:
-    """Sum of all entries that are named ``loss_…``, which TorchRL minimises.
-
-    Raises:
-        FloatingPointError: If it is not finite.
-    """
-    total = sum_of_losses(losses)
-    if not total.isfinite():
-        raise FloatingPointError(
-            f"The policy loss is {total.item()}: look for non-finite rewards, costs or "
-            "observations, or lower the target KL."
-        )
-    return total
 
 
 class TRPOStep(PolicyUpdate):
@@ -181,8 +166,6 @@ class TRPOStep(PolicyUpdate):
                 the policy has not changed.
         """
         batch = learning_samples(batch, self.actor_network.in_keys, self.loss)
-        if isinstance(self.loss, LossModule):
-            require_finite(batch, self.loss.in_keys)
         with torch.no_grad():
             reference = ReferencePolicy(policy_in(self.actor_network, batch))
         if isinstance(self.loss, SurrogateLoss):
@@ -203,7 +186,7 @@ class TRPOStep(PolicyUpdate):
         return metrics | proposal.diagnostics
 
     def _propose(self, problem: StepProblem) -> Proposal:
-        return self._natural_step(problem, total_loss)
+        return self._natural_step(problem, finite_sum)
 
     def _natural_step(
         self, problem: StepProblem, objective: Callable[[TensorDictBase], Tensor]

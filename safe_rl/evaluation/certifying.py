@@ -22,7 +22,7 @@ from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_la
 from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.measuring import PolicyEvaluation
 from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
-from safe_rl.files import check_no_links, read_json, replace_json, replacing
+from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
@@ -69,7 +69,6 @@ def certify(
     """
     run = Run(directory)
     config, limits = run.config, run.cost_limits
-    check_no_links(directory)
     candidates = _candidates(run)
     if not limits or not candidates:
         return None

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
@@ -22,10 +22,9 @@ from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.checks import Checked, Share
 from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
-from safe_rl.objectives.samples import require, require_finite, sample_mask
+from safe_rl.objectives.samples import require, sample_mask
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
-_ONE_PASS = "target_params needs two passes: use torchrl.objectives.value.GAE."
 
 
 class VectorGAE(Checked, ValueEstimatorBase):
@@ -121,12 +120,9 @@ class VectorGAE(Checked, ValueEstimatorBase):
             KeyError: If an entry is missing.
             ValueError: If values, signals and ends do not match in shape, if there is a dimension
                 between time and the signals, or if `target_params` is given.
-            FloatingPointError: If a signal, an observation or a value is not finite.
         """
-        if target_params is not None:
-            raise ValueError(_ONE_PASS)
         keys = self.tensor_keys
-        value, advantage, target = self._estimate(tensordict, params, None)
+        value, advantage, target = self._estimate(tensordict, params, None, target_params)
         tensordict.set(keys.value, value)
         tensordict.set(keys.advantage, advantage)
         return tensordict.set(keys.value_target, target)
@@ -147,17 +143,19 @@ class VectorGAE(Checked, ValueEstimatorBase):
             next_value: Values of the next observations, [..., T, F], instead of the network's.
             kwargs: Arguments of TorchRL's other estimators; they are ignored.
         """
-        if target_params is not None:
-            raise ValueError(_ONE_PASS)
-        return self._estimate(tensordict, None, next_value)[-1]
+        return self._estimate(tensordict, None, next_value, target_params)[-1]
 
     def _estimate(
-        self, tensordict: TensorDictBase, params: TensorDictBase | None, next_value: Tensor | None
+        self,
+        tensordict: TensorDictBase,
+        params: TensorDictBase | None,
+        next_value: Tensor | None,
+        target_params: TensorDictBase | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Value, advantage and value target, [..., T, F] each."""
+        if target_params is not None:
+            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys
-        observed = [] if self.value_network is None else list(self.value_network.in_keys)
-        require_finite(tensordict, [*observed, *(("next", key) for key in self.reward_keys)])
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
         reward = torch.cat(signals, -1)
         done, terminated = (
@@ -185,8 +183,6 @@ class VectorGAE(Checked, ValueEstimatorBase):
             reward, value, next_value = (
                 signal.masked_fill(padded, 0.0) for signal in (reward, value, next_value)
             )
-        values = TensorDict({keys.value: value, ("next", keys.value): next_value})
-        require_finite(values.auto_batch_size_(done.ndim - 1), values.keys(True, True))
         estimate = partial(gae, reward, value, next_value, done, terminated, gamma=self.gamma)
         advantage = estimate(lmbda=self.lmbda)
         # With λ = 1 the TD errors telescope: advantage + value is the bootstrapped return.

@@ -74,45 +74,32 @@ def learning_samples(
 
     Raises:
         ValueError: If sequences are padded.
+        FloatingPointError: If an entry that the loss lists as an input is NaN or infinite; the
+            message names it and how many samples.
     """
     mask = sample_mask(batch, loss)
     if FIRST not in in_keys:
-        flat = batch.reshape(-1)
-        return flat if mask is None else flat[mask.reshape(-1)]
-    if mask is not None or batch.ndim != 2:
+        batch = batch.reshape(-1)
+        batch = batch if mask is None else batch[mask.reshape(-1)]
+    elif mask is not None or batch.ndim != 2:
         raise ValueError(
             "A recurrent policy learns from whole sequences [N, T] as collectors make them, "
             "without padding: leave split_trajs at False."
         )
-    return batch
-
-
-def require_finite(tensordict: TensorDictBase, keys: Iterable[NestedKey]) -> None:
-    """Refuse a batch with NaN or infinite entries.
-
-    Args:
-        tensordict: Batch of any shape; padding may have any values.
-        keys: Entries to check if they are floating-point numbers; missing ones are ignored.
-
-    Raises:
-        FloatingPointError: If there are any; the message names the entry and how many samples.
-    """
-    mask = sample_mask(tensordict)
     # of nested TensorDicts all tensors
-    for key, entry in tensordict.select(*keys, strict=False).items(True, True):
-        if not entry.is_floating_point() or entry.is_meta:
-            continue
+    read = batch.select(*getattr(loss, "in_keys", ()), strict=False)
+    for key, entry in read.items(True, True):
         # A finite sum has only finite terms, and is much faster than a check of each term.
-        if mask is None and entry.sum().isfinite():
+        if not entry.is_floating_point() or entry.is_meta or entry.sum().isfinite():
             continue
-        wrong = ~entry.reshape(*tensordict.batch_size, -1).isfinite().all(-1)
-        wrong = wrong if mask is None else wrong & mask
+        wrong = ~entry.reshape(*batch.batch_size, -1).isfinite().all(-1)
         if wrong.any():
             raise FloatingPointError(
                 f"{key!r} is not finite in {int(wrong.sum())} of {wrong.numel()} samples. Nothing "
                 "has been learned from this batch: look for the environment's first NaN or "
                 "infinity, or lower the learning rate or the target KL if training has diverged."
             )
+    return batch
 
 
 class SharesTensors(LossModule):

@@ -130,24 +130,16 @@ class SurrogateLoss(Checked, SharesTensors):
             batch: Batch of any shape.
             limits: State after this batch; a loss without costs needs none.
 
-        Raises:
-            ValueError: If the loss has costs and gets no state.
         """
-        if not self.has_costs:
-            return batch
-        if limits is None:
-            raise ValueError(
-                f"{type(self).__name__} needs the state of the limits: pass what "
-                "Constraints.update(batch, episodes) returns, update(batch, limits)."
-            )
-        self.limits = limits
+        if self.has_costs:
+            self.limits = limits
         return batch
 
     def _known_limits(self) -> LimitState:
         if self.limits is None:
             raise ValueError(
-                f"{type(self).__name__} has no state of the limits yet: call "
-                "prepare(batch, limits) with every batch, before its first step."
+                f"{type(self).__name__} needs the state of the limits: call prepare(batch, limits) "
+                "with every batch, before its first step, and what Constraints.update returns."
             )
         return self.limits
 

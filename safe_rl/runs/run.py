@@ -131,13 +131,10 @@ class Run:
             return Path(which)
         from safe_rl.runs.checkpoints import best_checkpoint  # it needs torch
 
-        if which == "certified":
-            return self._certified()
-
         # the newest one, even if it cannot be read: an older one must not silently replace it
         newest = {kind: self.newest_checkpoint(kind) for kind in KINDS}
         newest["best"] = best_checkpoint(self.checkpoints_folder / "best")
-        path = newest[which]
+        path = self._certified() if which == "certified" else newest[which]
         if which == "last" and not self.has_begun:  # only a policy, see `pack_policy`
             path = path or newest["certified"]
         if path is None:
@@ -146,29 +143,25 @@ class Run:
                 "best": "no epoch kept every cost limit",
                 "certified": "none of its policies has been certified",
             }
-            other = next((kind for kind, other in newest.items() if other is not None), None)
-            hint = f" Use checkpoint={other}." if other else ""
+            others = (kind for kind, path in newest.items() if kind != which and path is not None)
+            hint = "".join(f" Use checkpoint={other}." for other in [*others][:1])
             raise FileNotFoundError(
                 f"{self.directory} has no {which} checkpoint: {reason[which]}.{hint}"
             )
         return path
 
-    def _certified(self) -> Path:
-        """The checkpoint that the certificate is about."""
+    def _certified(self) -> Path | None:
+        """The checkpoint that the certificate is about; None if it is gone."""
         name = (self.certificate or {}).get("checkpoint")
         path = self.checkpoints_folder / "certified" / Path(str(name)).name
-        if name is not None and self.certificate_of(path) is not None:
-            return path
         if name is None or not path.exists():
-            reason = "none of its policies has been certified"
-            other = next((kind for kind in KINDS[:2] if self.checkpoints(kind)), None)
-            hint = f" Use checkpoint={other}." if other else ""
-            raise FileNotFoundError(
-                f"{self.directory} has no certified checkpoint: {reason}.{hint}"
+            return None
+        if self.certificate_of(path) is None:
+            raise ValueError(
+                f"{path} is not the policy that {Run.certificate_file.name} is about: certify it "
+                "again."
             )
-        raise ValueError(
-            f"{path} is not the policy that {Run.certificate_file.name} is about: certify it again."
-        )
+        return path
 
     def certificate_of(self, checkpoint: Path) -> dict[str, Any] | None:
         """The certificate if it is about the policy in this file; None otherwise."""

@@ -64,15 +64,12 @@ class RunWriter:
             steps: Environment steps that it has made before.
 
         Raises:
-            FileExistsError: If the folder of a new run already holds one.
             RunInUseError: If another process writes into the folder.
             SettingError: If the logger cannot be made of its settings.
             ValueError: If the table lacks epochs of the continued run.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         with lock_folder(self.run.lock_file), ExitStack() as opened:
-            if epoch is None and self.run.has_begun:
-                raise FileExistsError(f"{self.directory} already holds a run.")
             self._steps_before = steps
             # a continued run replaces it after its first epoch: wrong settings fail before
             self._is_config_saved = False

@@ -87,8 +87,8 @@ class Claim:
     def __post_init__(self) -> None:
         if self.cap is not None and any(self.cap <= limit for limit in self.limits.values()):
             raise ValueError(
-                f"cap={self.cap:g}: it must be above every limit in {dict(self.limits)}, or every "
-                "policy would keep that limit."
+                f"certificate.cap={self.cap:g}: it must be above every limit of cost_limits, or "
+                "every policy would keep that limit."
             )
 
     def with_thresholds(self, costs: Costs) -> Claim:

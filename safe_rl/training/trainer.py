@@ -18,7 +18,6 @@ from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
-from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.writing import RunWriter
 from safe_rl.training.checkpoint_selection import CheckpointSelection, epochs_until_evaluated
 from safe_rl.training.state import (
@@ -144,8 +143,7 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        with lock_folder(self.writer.run.lock_file):
-            restored = self._checkpoints.resume(self.writer.run.num_rows)
+        restored = self._checkpoints.resume(self.writer.run.num_rows)
         if restored is not None:  # a run that starts over has begun its episodes already
             self._begin_episodes()
         return restored is not None

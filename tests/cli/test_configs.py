@@ -225,9 +225,6 @@ def test_cost_limits_must_name_costs_of_the_environment():
         check_cost_limits({"cost_hazard": 10}, keys)
     with pytest.raises(ValueError, match=r"no such cost\. It has cost, "):  # nothing like it
         check_cost_limits({"cost_pillars": 10}, keys)
-    for limit in (-1, "many", None, float("nan"), float("inf"), True, 10**400):
-        with pytest.raises(ValueError, match="'cost' is"):
-            check_cost_limits({"cost": limit}, keys)
     with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
         OnPolicy.from_config(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))
 

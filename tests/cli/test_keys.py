@@ -116,6 +116,8 @@ def test_no_value_ends_in_a_traceback():
         ("collector.num_collectors", 4, "use collector=process or collector=ray"),
         ("device", "cuda:99", "device=cuda:99: it must be cpu; or cuda or cuda:<number>, if torch"),
         ("env.name", "a/b", "env.name=a/b: it must be a name of a folder, without /"),
+        ("cost_limits", {"cost": math.inf}, "{'cost': inf}: it must be a finite number"),
+        ("cost_limits", {"cost": -1}, "{'cost': -1}: it must be greater than or equal to 0"),
         ("loss._target_", "torch.load", "loss._target_=torch.load: configurations reach only"),
     ],
 )

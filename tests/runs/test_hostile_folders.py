@@ -4,7 +4,6 @@ import pytest
 import yaml
 
 from safe_rl.cli.report import ReportOptions, report
-from safe_rl.collectors import Recording
 from safe_rl.evaluation.loading import robot_of
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import lock_folder
@@ -44,16 +43,6 @@ def test_a_folder_with_links_is_not_written_to(place, tmp_path):
     with pytest.raises(ValueError, match=rf"{place} is a link"), lock_folder(Run(run).lock_file):
         pass
     assert listing(mine) == ["00000000.pt"]
-
-
-def test_a_linked_recording_is_not_begun_anew(tmp_path):
-    mine = tmp_path / "mine"
-    mine.mkdir()
-    (mine / "00000003.pt").touch()
-    (tmp_path / "run").symlink_to(mine)
-    with pytest.raises(ValueError, match="is a link"):
-        Recording(tmp_path / "run", ["cost"]).begin()
-    assert listing(mine) == ["00000003.pt"]
 
 
 @pytest.mark.parametrize("name", ["../elsewhere", "..", "../", "a/b"])

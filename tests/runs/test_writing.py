@@ -103,15 +103,6 @@ def test_a_risk_measure_is_what_is_held_against_the_limit(tmp_path, capsys):
     assert "cost=89.0/25" in capsys.readouterr().err
 
 
-def test_a_new_run_does_not_overwrite_another(tmp_path):
-    config = compose_config("env=PointMass", "logger=none")
-    with RunWriter(Run(tmp_path), config, {}, 1000).writing():
-        pass
-    again = RunWriter(Run(tmp_path), config, {}, 1000).writing()
-    with pytest.raises(FileExistsError, match="already holds a run"):
-        again.__enter__()
-
-
 def test_what_is_killed_while_it_begins_leaves_no_table_without_a_configuration(
     tmp_path, monkeypatch
 ):
