@@ -1,5 +1,6 @@
 """What the attacks share: random cases for some seconds, processes to kill, small runs."""
 
+import multiprocessing
 import os
 import random
 import signal
@@ -8,7 +9,11 @@ import sys
 import time
 from contextlib import suppress
 
+import torch
 from commands import ROOT, SMALL
+from run_configs import compose_config
+
+from safe_rl.training.train import train
 
 SEED = int(os.environ.get("ATTACK_SEED") or time.time())
 """Every week another one; a failure names it, and ATTACK_SEED=… repeats it."""
@@ -29,6 +34,29 @@ def cases(name, seconds, least=3):
         yield random.Random(case)
         number += 1
     print(f"{name}: {number} cases", file=sys.__stderr__, flush=True)
+
+
+def begin_or_continue(folder, words):
+    """Train in a folder by a configuration."""
+    train(compose_config(*words), folder, continues=(folder / "config.yaml").exists())
+
+
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(["safe_rl.cli.python_api", "safe_rl.training.train"])
+
+
+def exit_code_of(work, *arguments):
+    """Call a function in a process of its own, which has imported everything in no time."""
+    process = SERVER.Process(target=_in_one_thread, args=(work, *arguments), daemon=True)
+    process.start()
+    process.join(300)
+    assert process.exitcode is not None, "it hangs"
+    return process.exitcode
+
+
+def _in_one_thread(work, *arguments):
+    torch.set_num_threads(1)
+    work(*arguments)
 
 
 def start(*words, limits="", **environment):

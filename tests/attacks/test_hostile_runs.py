@@ -20,14 +20,20 @@ MARK = "\x1b[31m"
 VALUES = (None, True, -1, 3, 1e300, float("nan"), "", "x", MARK, "../..", [], [1], {}, {"a": MARK})
 
 
+REPLAY = [word for word in RUN if not word.startswith("critic_update")]
+REPLAY += ["algo=sac_lagrangian", "exploration.random_steps=80", "memory.batch_size=8"]
+REPLAY += ["memory.keep=true", "memory.n_steps=3", "certificate.episodes=0"]
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A certified and evaluated run with a recording."""
-    folder = tmp_path_factory.mktemp("trained") / "run"
+    """A certified and evaluated run with a recording, and a run with a replay buffer."""
+    folder, replay = (tmp_path_factory.mktemp("trained") / name for name in ("run", "replay"))
     test = ["certificate.ranking=2", "certificate.episodes=20", "cost_limits={cost: 1000}"]
     train(compose_config(*RUN, "frames=160", "record=true", *test), folder)
     safe_rl.evaluate(folder, episodes=2, num_envs=2, num_threads=1)
-    return folder
+    train(compose_config(*REPLAY, "frames=160"), replay)
+    return folder, replay
 
 
 def change_bytes(random, path):
@@ -117,12 +123,13 @@ def test_changed_files_are_used_or_refused_in_a_line(trained, tmp_path, capfd):
     mine = tmp_path / "mine"
     mine.write_text("mine")
     signal.signal(signal.SIGALRM, give_up)
-    for random in cases("hostile runs", 150, least=20):
-        run = shutil.copytree(trained, tmp_path / "runs" / "run")
+    for random in cases("hostile runs", 110, least=20):
+        source = random.choice([*trained, trained[0]])
+        run = shutil.copytree(source, tmp_path / "runs" / "run")
         path = random.choice([path for path in sorted(run.rglob("*")) if path.is_file()])
         change = random.choice([change_bytes, cut, replace, edit, edit, edit])
         name = random.choice(list(ACTIONS))
-        print(change.__name__, path.relative_to(run), name, flush=True)
+        print(change.__name__, source.name, path.relative_to(run), name, flush=True)
         if path.stat().st_size:
             change(random, path)
         signal.alarm(120)

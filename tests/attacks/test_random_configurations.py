@@ -42,7 +42,7 @@ def composed(*words):
 
 def test_a_run_in_two_parts_has_the_table_of_one(tmp_path):
     refusals = []
-    for random in cases("random configurations", 150, least=10):
+    for random in cases("random configurations", 110, least=10):
         algorithm = random.choice(ALGORITHMS)
         words = [*GENERAL, f"algo={algorithm}", f"env={random.choice(ENVIRONMENTS)}"]
         words += [*with_sizes(algorithm), "certificate.episodes=0", "model.hidden_sizes=[8]"]
