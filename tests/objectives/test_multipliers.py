@@ -113,5 +113,5 @@ def test_one_that_cannot_move_is_not_built():
     class Still(Multiplier):
         pass
 
-    with pytest.raises(TypeError, match="Still.*_step"):
+    with pytest.raises(TypeError, match=r"Still.*_step"):
         Still({"cost": 25.0})
