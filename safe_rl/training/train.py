@@ -59,6 +59,7 @@ def is_expected(error: Exception) -> bool:
     return is_known and _UNEXPECTED not in getattr(error, "__notes__", ())
 
 
+@torch.enable_grad()  # a notebook may have turned gradients off
 def train(
     config: DictConfig,
     directory: Path | str,

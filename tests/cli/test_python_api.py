@@ -208,6 +208,10 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
         run.evaluate(certify=True)
     with pytest.raises(ValueError, match=r"variations by vary"):
         run.evaluate(variations="dynamics")
+    with pytest.raises(ValueError, match=r"episodes=0: a test needs episodes"):
+        run.certify(episodes=0)
+    with pytest.raises(ValueError, match=r"variations=\{\}: it must have rows"):
+        run.vary({})
 
 
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():

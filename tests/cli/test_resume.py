@@ -47,7 +47,7 @@ def test_folders_may_have_any_name(tmp_path, name):
         *("env.hazards_num=3", "env=CarGoal1", "seed=3", "num_envs=8", "hydra.run.dir=elsewhere"),
         *("model.hidden_sizes=[8]", "+env.hazards_num=3", "cost_limits={cost: 3}", "+mine=3"),
         *("init_from=elsewhere", "policy_update.optimizer.lr=1e-5", "lagrangian.init=3"),
-        *("policy_update._target_=os.system", "collector=process"),
+        *("policy_update._target_=os.system", "collector=process", "hydra.nope=3"),
     ],
 )
 def test_what_is_not_marked_as_changing_stays(run, override):

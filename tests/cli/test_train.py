@@ -59,6 +59,12 @@ def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
         command("lr=1e-4")
 
 
+def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):
+    monkeypatch.setattr("safe_rl.training.building.os.sysconf", lambda name: 100)
+    status, *_ = command(*SMALL, "frames=40")
+    assert status == "frames_per_batch=40: a batch takes 0 GB, and there are 0 GB."
+
+
 def test_a_run_that_cannot_be_built_leaves_no_file(command):
     refused = ("env=PointGoal1", "algo=cpo", "cost_limits={}", "logger=none", "num_envs=1")
     Path("mine").mkdir()

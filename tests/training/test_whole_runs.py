@@ -4,7 +4,8 @@ import os
 import signal
 
 import pytest
-from run_configs import compose_config
+import torch
+from run_configs import compose_config, without_times
 
 from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.run import Run
@@ -98,6 +99,13 @@ def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
     finally:
         os.write(proceed[1], b"x")
         os.waitpid(child, 0)
+
+
+def test_a_notebook_without_gradients_trains_as_usual(tmp_path):
+    usual = train(small("certificate.episodes=0"), tmp_path / "usual")
+    with torch.no_grad():
+        run = train(small("certificate.episodes=0"), tmp_path / "run")
+    assert without_times(run.table_file) == without_times(usual.table_file)
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path):
