@@ -17,7 +17,7 @@ import torch
 import torchrl.envs
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded
+from torchrl.data import Binary, Bounded, Categorical, OneHot
 from torchrl.envs import (
     ActionScaling,
     BatchSizeTransform,
@@ -141,6 +141,16 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
             )
         yield ActionScaling()
         yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)
+        return
+    if isinstance(spec, Bounded):  # a MultiDiscrete of several environments
+        is_choice = not spec.space.low.any()
+    else:
+        is_choice = isinstance(spec, Categorical | OneHot) and not isinstance(spec, Binary)
+    if not is_choice:
+        raise ConfigError(
+            "The algorithms need actions that are continuous and bounded (a Box) or choices "
+            f"(Discrete, MultiDiscrete), got {type(spec).__name__} {spec.dtype}."
+        )
 
 
 def _row(bounds: Tensor) -> list[float]:
