@@ -201,8 +201,11 @@ def single(campaign: str) -> str:
             bound = told["bounds"]["mean_cost"]["bound"]
             row["bound"] = f"≤ {bound:.1f} at {told['episode_return']:.1f}"
         rows.append(row)
-    settings = ["name"] if campaign in ("one_transform", "push", "doggo") else []
-    ends = ("cost", "return", "rate", "bound")
+    named = ("one_transform", "push", "doggo", "privileged_trials")
+    settings = ["name"] if campaign in named else []
+    # of trials that were stopped, ends cannot be compared
+    ends = () if campaign == "privileged_trials" else ("cost", "return", "rate", "bound")
+    names = [name for name in names if any(row[name] for row in rows)]
     return table(rows, "environment", *settings, "seed", *ends, "steps", *names)
 
 
