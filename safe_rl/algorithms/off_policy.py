@@ -19,7 +19,7 @@ from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import ColouredNoise, ExploringPolicy, QEnsemble
+from safe_rl.models import ExploringPolicy, QEnsemble
 from safe_rl.models.encoders import (
     Codes,
     Observed,
@@ -125,9 +125,10 @@ class OffPolicy(Resumable, Algorithm):
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
-        noise, colour = map(config.exploration.get, ("noise", "colour"))
         return cls(
-            policy=exploring(networks["actor"], env, noise, colour, loss.retrace is not None),
+            policy=exploring(
+                networks["actor"], env, config.exploration.noise, loss.retrace is not None
+            ),
             networks=networks,
             constraints=constraints,
             multiplier=multiplier,
@@ -145,7 +146,7 @@ class OffPolicy(Resumable, Algorithm):
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build the policy for evaluation, without exploration noise."""
         actor = build_networks(config, env, 0, device)["actor"]
-        return exploring(actor, env), {"actor": actor}
+        return exploring(actor, env, 0.0), {"actor": actor}
 
     @property
     def lost_on_resume(self) -> str:
@@ -222,7 +223,6 @@ class OffPolicy(Resumable, Algorithm):
             "policy_update": self.policy_update,
             "algorithm": self,
             "memory": self.replay_buffer if self.replay_buffer.keeps else None,
-            "exploration": self.policy.coloured,
         }
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -262,18 +262,11 @@ def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
 
 
 def exploring(
-    actor: TensorDictModuleBase,
-    env: EnvBase,
-    noise: float = 0.0,
-    colour: float | None = None,
-    is_scored: bool = False,
+    actor: TensorDictModuleBase, env: EnvBase, noise: float, is_scored: bool = False
 ) -> ExploringPolicy:
     """The exploring policy of an actor, within the bounds of an environment's actions."""
-    spec, decisions = bounded_actions(env), -(-env.max_episode_steps // env.steps_per_decision)
-    coloured = ColouredNoise(colour, decisions) if colour else None
-    return ExploringPolicy(
-        actor, spec.low, spec.high, noise=noise, coloured=coloured, is_scored=is_scored
-    )
+    spec = bounded_actions(env)
+    return ExploringPolicy(actor, spec.low, spec.high, noise=noise, is_scored=is_scored)
 
 
 def build_networks(

@@ -88,8 +88,6 @@ class Exploration:
     random_steps: Annotated[Any, typed(NonNegativeInt)]  # random steps at the beginning
     # standard deviation of a deterministic policy's noise, in half ranges of actions
     noise: NonNegativeFloat
-    # exponent β of correlated noise, whose power falls with the frequency f as f^-β; 0: white noise
-    colour: Annotated[float, Interval(ge=0, le=3)]
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from safe_rl.models.build_networks import build_networks
 from safe_rl.models.collecting_policies import (
     BehaviourPolicy,
-    ColouredNoise,
     ExploringPolicy,
     HeldActions,
     make_behaviour,
@@ -19,7 +18,6 @@ from safe_rl.models.replay_networks import (
 
 __all__ = [
     "BehaviourPolicy",
-    "ColouredNoise",
     "EnsembleMLP",
     "ExploringPolicy",
     "HeldActions",

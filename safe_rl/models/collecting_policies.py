@@ -14,7 +14,6 @@ from torchrl.modules import IndependentNormal
 
 from safe_rl.models.networks import Chain
 from safe_rl.naming import BEHAVIOUR, STEPS_TAKEN
-from safe_rl.resumable import Resumable
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
@@ -71,72 +70,6 @@ class BehaviourPolicy(TensorDictModuleBase):
         return tensordict
 
 
-TRAJECTORY = ("collector", "traj_ids")
-"""Where TorchRL's collectors write the number of a row's episode."""
-
-
-class ColouredNoise(Resumable):
-    """Standard normal noise that is correlated over the steps of an episode, for every row.
-
-    Its power falls with the frequency f as f^−β. With white noise (β = 0) steps undo each other;
-    red noise (β = 2) drifts to the bounds. Eberhard et al. 2023 (*Pink Noise Is All You Need*)
-    recommend β = 1. A new sequence begins with every episode, as TorchRL's collectors number them.
-
-    Args:
-        beta: Exponent β.
-        length: Steps of the longest episode; after as many steps a row gets a new sequence.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> noise = ColouredNoise(1.0, length=20)
-        >>> noise(TensorDict(batch_size=[5]), torch.zeros(5, 2)).shape
-        torch.Size([5, 2])
-    """
-
-    state_names = ("_values", "_taken")
-
-    def __init__(self, beta: float, length: int) -> None:
-        self.beta, self.length = beta, length
-        self._values = torch.zeros(0, 0, 0)  # [N, A, length]
-        self._taken = torch.zeros(0, dtype=torch.int64)
-        self._episodes: Tensor | None = None
-
-    def __call__(self, tensordict: TensorDictBase, like: Tensor) -> Tensor:
-        """Return the noise of the next step, of the shape and on the device of `like`, [N, A]."""
-        if self._values.shape[:2] != like.shape:
-            self._values = like.new_zeros(*like.shape, self.length)
-            self._taken = torch.full(like.shape[:1], self.length, device=like.device)
-        begins = self._taken >= self.length
-        episodes = tensordict.get(TRAJECTORY, None)
-        if episodes is not None and self._episodes is not None:
-            begins = begins | (episodes != self._episodes)
-        self._episodes = None if episodes is None else episodes.clone()
-        if begins.any():
-            shape = self._values[begins].shape
-            self._values[begins] = coloured_noise(self.beta, *shape, device=like.device)
-            self._taken[begins] = 0
-        index = self._taken[:, None, None].expand(*like.shape, 1)
-        self._taken = self._taken + 1
-        return self._values.gather(-1, index).squeeze(-1)
-
-
-def coloured_noise(beta: float, *shape: int, device: torch.device | None = None) -> Tensor:
-    """Draw sequences of standard normal numbers, [..., L], whose power is proportional to f^−β.
-
-    Timmer, König 1995 (*On Generating Power Law Noise*): independent normal numbers are scaled in
-    the frequency domain. Frequency 0 has the power of the lowest other one.
-    """
-    length = shape[-1]
-    frequencies = torch.fft.rfftfreq(length, device=device).clamp_min(1 / length)
-    scale = frequencies ** (-beta / 2)
-    # every other frequency stands for its negative, too
-    is_alone = torch.fft.rfftfreq(length, device=device) % 0.5 == 0
-    variance = (scale.square() * torch.where(is_alone, 1, 2)).sum() / length**2
-    drawn = torch.randn(*shape[:-1], len(scale), dtype=torch.complex64, device=device)
-    drawn = torch.where(is_alone, drawn * 2**0.5, drawn)  # of these only the real part counts
-    return torch.fft.irfft(drawn * scale / variance.sqrt(), n=length)
-
-
 class ExploringPolicy(TensorDictModuleBase):
     """Policy of off-policy collection: the actor's actions, or uniformly random ones at first.
 
@@ -152,7 +85,6 @@ class ExploringPolicy(TensorDictModuleBase):
         high: Upper bounds of the action, [A].
         noise: Standard deviation of the noise of a deterministic actor, as a fraction of half the
             action's range.
-        coloured: Noise that is correlated over time, of both kinds of actors; None: white noise.
         is_scored: Whether to write the log-density of a Gaussian actor's actions, too.
 
     Attributes:
@@ -182,11 +114,10 @@ class ExploringPolicy(TensorDictModuleBase):
         high: Tensor,
         *,
         noise: float = 0.0,
-        coloured: ColouredNoise | None = None,
         is_scored: bool = False,
     ) -> None:
         super().__init__()
-        self.coloured, self._is_scored = coloured, is_scored
+        self._is_scored = is_scored
         self._samples = isinstance(actor, ProbabilisticTensorDictSequential)
         network, sampler = (actor.module[0], actor.module[-1]) if self._samples else (actor, actor)
         self.network, self.noise = network.module, noise
@@ -204,12 +135,12 @@ class ExploringPolicy(TensorDictModuleBase):
         half = (self.high - self.low) / 2
         if self._samples:
             loc, scale = outputs
-            inner = torch.addcmul(loc, scale, self._normal(tensordict, loc)) if is_noisy else loc
+            inner = torch.addcmul(loc, scale, torch.randn_like(loc)) if is_noisy else loc
             action = self.low + half * (1 + inner.tanh())
             if self._is_scored:
                 tensordict.set(BEHAVIOUR, self._log_density(inner, loc, scale, half))
         elif is_noisy and self.noise:
-            action = outputs + self.noise * half * self._normal(tensordict, outputs)
+            action = outputs + self.noise * half * torch.randn_like(outputs)
             action = action.clamp(self.low, self.high)
         else:
             action = outputs
@@ -224,10 +155,6 @@ class ExploringPolicy(TensorDictModuleBase):
         normal = -0.5 * ((inner - loc) / scale).square() - scale.log() - 0.5 * math.log(2 * math.pi)
         uniform = -(2 * half).log()
         return torch.where(self.is_random, uniform, normal - slope - half.log()).sum(-1)
-
-    def _normal(self, tensordict: TensorDictBase, like: Tensor) -> Tensor:
-        """Standard normal numbers of the shape of `like`."""
-        return torch.randn_like(like) if self.coloured is None else self.coloured(tensordict, like)
 
 
 class HeldActions(TensorDictModuleBase):

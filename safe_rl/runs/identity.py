@@ -92,7 +92,6 @@ _SILENT: dict[str, Hashable] = {
     "env.physics": "cpu",
     "env.physics_buffers": 2.0,
     "env.observe_privileged": False,
-    "exploration.colour": 0.0,
     "loss.cost_gamma": None,
     "loss.retrace": None,
     "model.critic_observes": ("observation",),

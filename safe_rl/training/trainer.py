@@ -30,9 +30,7 @@ from safe_rl.training.state import (
 
 # Parts that only the newest checkpoints hold, for resuming: a replay buffer has gigabytes, the
 # others are several times as large as a policy.
-_FOR_RESUMING = {
-    *("memory", "policy_update", "critic_update", "exploration", "env", "accounting", "rng"),
-}
+_FOR_RESUMING = {"memory", "policy_update", "critic_update", "env", "accounting", "rng"}
 
 
 Evaluator = Callable[[int, int], dict[str, float]]

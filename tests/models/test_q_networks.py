@@ -9,7 +9,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, TanhNormal
 
 from safe_rl.models import (
-    ColouredNoise,
     EnsembleMLP,
     ExploringPolicy,
     QEnsemble,
@@ -105,47 +104,6 @@ def test_it_adds_noise_to_a_deterministic_actor_within_bounds():
     with torch.no_grad():
         wild = ExploringPolicy(actor, LOW, HIGH, noise=10.0)(batch)[key]
     assert ((wild >= LOW) & (wild <= HIGH)).all()
-
-
-@pytest.mark.parametrize("beta", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("make", [make_squashed_actor, make_bounded_actor])
-def test_the_power_of_coloured_noise_falls_with_the_frequency(make, beta):
-    actor, length = make(5, LOW, HIGH, hidden_sizes=[8]), 256
-    coloured = ColouredNoise(beta, length)
-    explorer = ExploringPolicy(actor, LOW, HIGH, noise=0.05, coloured=coloured)
-    batch = observations(1).expand(2_000).clone()
-    with torch.no_grad():
-        actions = torch.stack([explorer(batch.clone())["action"] for _ in range(length)])
-        shares = 2 * (actions - LOW) / (HIGH - LOW) - 1  # in [-1, 1]
-        outputs = explorer.network(batch["observation"][0])
-    if make is make_squashed_actor:
-        noise = (shares.atanh() - outputs[0]) / outputs[1]
-    else:
-        noise = (shares - (2 * (outputs - LOW) / (HIGH - LOW) - 1)) / 0.05
-    noise = noise.movedim(0, -1)
-    torch.testing.assert_close(noise.var(0), torch.ones(2, length), rtol=0.2, atol=0)
-    power = torch.fft.rfft(noise).abs().square().mean((0, 1))[1:-1]
-    frequency = torch.fft.rfftfreq(length)[1:-1]
-    points = torch.stack([frequency.log(), power.log()])
-    covariance = torch.cov(points)
-    assert -covariance[0, 1] / covariance[0, 0] == pytest.approx(beta, abs=0.1)
-
-
-def test_coloured_noise_begins_anew_with_an_episode():
-    torch.manual_seed(0)
-    noise, like = ColouredNoise(2.0, 1_000), torch.zeros(500, 2)
-    numbers = torch.arange(500)
-    step = TensorDict(collector={"traj_ids": numbers}, batch_size=[500])
-    before, after = noise(step, like), noise(step, like)
-    assert (before * after).mean() > 0.9
-    begins = numbers % 2 == 0
-    step["collector", "traj_ids"] = numbers + 500 * begins
-    other = noise(step, like)
-    assert (after * other)[~begins].mean() > 0.9
-    assert (after * other)[begins].mean().abs() < 0.2
-    copy = ColouredNoise(2.0, 1_000)
-    copy.load_state_dict(noise.state_dict())
-    assert torch.equal(copy(step, like), noise(step, like))
 
 
 def test_it_begins_at_random_but_is_never_evaluated_so():
