@@ -38,8 +38,9 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
 def inputs_of(network: TensorDictModuleBase, batch: TensorDictBase) -> TensorDictBase:
     """A copy of the inputs of a network, into which the network may write.
 
-    Without a copy, a policy would overwrite the behaviour policy's parameters in the batch if they
-    are below one of its inputs.
+    A policy may write the parameters of a composite distribution one by one, below ``"params"``.
+    Then ``"params"`` is also one of its inputs. Without a copy, it would overwrite the behaviour
+    policy's parameters in the batch.
     """
     return batch.select(*network.in_keys).copy()
 
