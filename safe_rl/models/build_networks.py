@@ -59,8 +59,8 @@ def build_networks(
     encoders = model.get("encoders")
     layouts = {"observation": layout, "privileged": privileged_layout or {}}
     observed = Observed(entries, layouts, model["input_scale"], clip=normalise, encoders=encoders)
-    chosen = model.get("critic_observes")
-    read = critic_entries(chosen, observation_spec) if chosen else entries
+    chosen = list(model.get("critic_observes") or ["observation"])
+    read = entries if chosen == ["observation"] else critic_entries(chosen, observation_spec)
     check_encoders(observed)
     widths = list(model["hidden_sizes"])
     recurrent_size = model["memory"]["size"] if model.get("memory") else 0
