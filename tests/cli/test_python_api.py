@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,6 +176,20 @@ def test_strange_texts_arrive_as_they_are(text):
     assert parsed.value() == {"b": [text, {"c": text}]}
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"episode": 3}, "Unknown option 'episode'. Did you mean 'episodes'"),
+        ({"episodes": 2, "cost_limits": {"cots": 3}}, "no such cost. Did you mean 'cost'"),
+    ],
+)
+def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, message):
+    with pytest.raises(ValueError, match=message):
+        run.evaluate(**options)
+    with pytest.raises(ValueError, match=message):
+        run.vary({"few": {"env.hazards_num": 2}}, **options)
+
+
 @pytest.mark.parametrize("choice", [{"env": {"hazards_num": 3}}, {"algo": None}])
 def test_environments_and_algorithms_are_names(choice, tmp_path):
     with pytest.raises(ValueError, match=r"^env and algo are names\. .*store_config.*config_dir"):
@@ -214,12 +229,44 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
         run.vary({})
 
 
+def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch):
+    given = []
+    monkeypatch.setattr(
+        "safe_rl.training.train.certify_run",
+        lambda *said, **options: given.append((*said, options)),
+    )
+    run.certificate_file.unlink()
+    safe_rl.resume(run.directory, **{"certificate.episodes": 4})
+    ((directory, options),) = given
+    assert directory == run.directory
+    assert options["num_threads"] == 1
+    assert options["changes"] == {**run.config.certificate, "episodes": 4}
+
+
 def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_takes_them():
     given = {"env.outside": {"cost_a": [0, -1, 1]}, "seed": np.int64(3)}
     assert list(overrides_of(given)) == ["env.outside={cost_a:[0,-1,1]}", "seed=3"]
     assert list(overrides_of({"layers": np.array([8, 4])})) == ["layers=[8,4]"]
     with pytest.raises(ValueError, match=r"^loss=.*<class .*: a setting takes numbers"):
         list(overrides_of({"loss": {"_target_": Trainer}}))
+
+
+def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(run.directory.parent))
+    assert safe_rl.load(f"~/{run.directory.name}").directory == run.directory
+    page = safe_rl.report(run.directory, out="~/page", archive="~/kept")
+    assert {page.parent, Path("~/kept").expanduser()} <= {*run.directory.parent.iterdir()}
+    monkeypatch.setenv("HOME", str(tmp_path))
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    refusals = {
+        "config.yaml": rf"would replace {taken}/conf",
+        "progress.csv": rf"resume\('{taken}'\)",
+    }
+    for name, words in refusals.items():  # the first may be the user's own
+        (taken / name).touch()
+        with pytest.raises(FileExistsError, match=words):
+            safe_rl.train("PointGoal0", algo="cpo", frames=40, directory="~/taken", **SMALL)
 
 
 @pytest.mark.parametrize(

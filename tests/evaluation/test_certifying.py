@@ -338,6 +338,22 @@ def test_what_an_episode_can_cost_is_known_from_the_environment():
     assert highest(transforms={"stop": {**stop, "in_evaluation": True}}, evaluating=True) == 5.0
 
 
+@pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
+def test_levels_are_not_rounded(level, shown):
+    certificate = Certificate(None, math.nan, Verdict(None, []), replace(OPTIONS, level=level))
+    assert f"at {shown} with sampled actions: " in str(certificate)
+
+
+def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
+    bounds = {"mean_cost": (10.82, 5.0), "mean_fast": (1.0, 2.0)}
+    verdict = Verdict(None, [0], bounds, {"mean_cost": 5.82}, [], {}, 20)
+    certificate = Certificate(None, math.nan, verdict, OPTIONS)
+    assert str(certificate).endswith("(mean_cost ≤ 10.9, limit 5; 20 new episodes).")
+    # 120 can never suffice
+    assert "at least 561 are needed" in str(replace(certificate, fewest=561))
+    assert "No number of episodes" in str(replace(certificate, fewest=math.inf))
+
+
 CHECKPOINT = Path("checkpoint-000000000100.torchrl")
 
 

@@ -1,5 +1,6 @@
 """Which episodes are counted, on an environment whose lengths are known; layouts by counting."""
 
+import itertools
 from inspect import Signature
 from unittest.mock import Mock
 
@@ -146,6 +147,15 @@ def test_a_film_takes_the_pictures_that_an_environment_has():
     assert len({frame[48:].tobytes() for frame in frames}) == 4
 
 
+@pytest.mark.parametrize("shape", [(50, 70), (1, 50, 70, 3), (50, 70, 4)])
+def test_a_film_takes_grey_pictures_batches_and_fourth_channels(shape):
+    env, policy = Drawn(), small_policy()
+    env.render = lambda: np.full(shape, 200, np.uint8)
+    check_camera(env, "free")
+    frames = list(record_episode(env, policy, **FILM))
+    assert {(frame.shape, int(frame[0, 0, 0])) for frame in frames} == {((68, 280, 3), 200)}
+
+
 def test_what_prevents_a_film_is_said_before_any_episode():
     with pytest.raises(ValueError, match="camera=track: this environment has no cameras"):
         check_camera(Drawn(), "track")
@@ -165,6 +175,18 @@ def test_what_prevents_a_film_is_said_before_any_episode():
 
 FIXED = {"randomize_layout": False, "layout_seeds": None, "layout_seeds_first": 0}
 UNLIMITED = {**FIXED, "randomize_layout": True}
+
+
+@pytest.mark.parametrize(
+    ("trained", "evaluated"), list(itertools.product([(0, 5), (3, 4), (9, 1)], repeat=2))
+)
+def test_shared_layouts_are_those_in_both_ranges(trained, evaluated):
+    envs = [
+        {**UNLIMITED, "layout_seeds_first": first, "layout_seeds": number}
+        for first, number in (trained, evaluated)
+    ]
+    met, shown = (set(range(first, first + number)) for first, number in (trained, evaluated))
+    assert shared_layouts(*envs, same_seed=False) == len(met & shown) / len(shown)
 
 
 def test_layouts_without_a_range_are_known_where_they_are_fixed_and_the_seed_is_trainings():
