@@ -157,10 +157,3 @@ def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypat
     monkeypatch.setattr(Trainer, "epoch", fail)
     (line,) = command(*SMALL, "frames=40")[0].splitlines()
     assert words in line
-
-
-def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):
-    monkeypatch.setattr("safe_rl.training.building.os.sysconf", lambda name: 100)
-    status, *_ = command(*SMALL, "frames=40")
-    assert status == "frames_per_batch=40: a batch takes 0 GB, and there are 0 GB."
-    assert list(Path.cwd().rglob("*.csv")) == []
