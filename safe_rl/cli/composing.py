@@ -197,8 +197,7 @@ def _unknown_choice(error: MissingConfigException) -> str:
         return "there is no preset 'paper'. For its numbers write algo=paper/cpo, and so on."
     known = list(error.options or ())
     if not known:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+        known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
     file = re.match(r"In '(?!config)([^']+)'", str(error))
     place = f"{file[1]}.yaml: " if file else ""
     all_of_them = f"There are {', '.join(known)}"

@@ -21,10 +21,8 @@ from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, Positi
 
 from safe_rl.checks import SettingError, Text, check_value, rule
 from safe_rl.evaluation.settings import CertificateOptions, Device
-from safe_rl.extras import require_extra
 from safe_rl.naming import join_keys, nearest
 from safe_rl.runs.identity import flatten
-from safe_rl.trust import locate
 
 
 def typed(kind: Any) -> GetPydanticSchema:
@@ -222,14 +220,6 @@ def _check_all(config: DictConfig) -> None:
     if "_target_" not in config.model:
         _check(Model, config.model, "model")
     check_value("env.name", Folder, config.env.name)
-    for key in ("collector", "logger"):
-        target = config[key].get("_target_")
-        extra = getattr(locate(target, f"{key}._target_"), "needed_extra", None) if target else None
-        if extra is not None:
-            try:
-                require_extra(*extra)
-            except ModuleNotFoundError as error:
-                raise SettingError(f"{key}: {error}") from None
     if not config.collector.get("_target_") and config.collector.get("num_collectors") != 1:
         raise SettingError(
             "collector.num_collectors: collector=local is one process; for more use "

@@ -29,6 +29,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.checks import checked
 from safe_rl.collectors.processes import leave_signals_to_parent, starting_processes
+from safe_rl.extras import import_extra
 
 
 class MakeEnv(Protocol):
@@ -324,7 +325,7 @@ def make_ray_collector(  # noqa: D417
             this process. With ``log_to_driver: true``, actors also print here, not only to files.
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
-    import ray
+    ray = import_extra("ray", "ray")
 
     def start(makers: Makers) -> RayCollector:
         collector = RayCollector(
@@ -345,6 +346,3 @@ def make_ray_collector(  # noqa: D417
     if not ray.is_initialized():
         ray.init(**{"log_to_driver": False, **ray_init})
     return workers
-
-
-make_ray_collector.needed_extra = ("ray", "ray")  # type: ignore[attr-defined]

@@ -25,8 +25,8 @@ from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
 from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
-from safe_rl.runs.command import config_dirs, repeating
 from safe_rl.runs.folder import checkpoint_steps, is_unfinished
+from safe_rl.runs.identity import config_dirs, repeating
 from safe_rl.runs.run import Run
 
 POLICIES = Path(__file__).parents[1] / "policies"

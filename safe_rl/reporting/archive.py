@@ -23,9 +23,8 @@ from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml, replacing
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
-from safe_rl.runs.command import config_dirs, repeating, select
 from safe_rl.runs.folder import paths_below
-from safe_rl.runs.identity import differences, role_of
+from safe_rl.runs.identity import config_dirs, differences, repeating, role_of, select
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"

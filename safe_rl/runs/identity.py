@@ -1,19 +1,23 @@
 """Roles of a configuration's keys: which define the experiment, and which may change on resume.
 
 All code that compares runs uses this table: ``resume=``, sweeps with their folders, reports.
+Hydra's notes of a run have the settings of its command line: its command is made again from them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+import os
+import shlex
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any, cast
 
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.files import read_yaml
+from safe_rl.files import PROGRAM, read_yaml
 from safe_rl.runs.folder import common_source
 from safe_rl.runs.run import Run
 
@@ -212,3 +216,45 @@ def check_same_run(run: Run, config: DictConfig) -> None:
             f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
             "the sweep another folder with hydra.sweep.dir=..."
         )
+
+
+def select(node: Any, *keys: str) -> Any:
+    """The value at a path of keys in nested mappings, or None."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
+
+
+def config_dirs(notes: Any) -> list[str]:
+    """Folders of ``--config-dir``, and of ``config_dir`` in Python, in Hydra's notes of a run.
+
+    They are relative to the folder where the run was started, as the user has typed them.
+    """
+    runtime = select(notes, "hydra", "runtime")
+    start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
+    paths = [s["path"] for s in sources if s["provider"].endswith("command-line")]
+    return [os.path.relpath(path, start) if start else path for path in paths]
+
+
+def repeating(overrides: Sequence[str], folders: Iterable[str], frames: int | None = None) -> str:
+    """The command that repeats a run.
+
+    Args:
+        overrides: Overrides that Hydra has noted.
+        folders: Folders of ``--config-dir``.
+        frames: The number of frames, if a run was continued to more than the overrides say.
+
+    Examples:
+        >>> words = ["import=['my_gym.py','mine']", "cost_limits={cost: 5}"]
+        >>> repeating(words, ["conf"]).partition(" --")[2]
+        "config-dir=conf import=my_gym.py import=mine 'cost_limits={cost: 5}'"
+    """
+    words = [f"--config-dir={folder}" for folder in folders]
+    for word in overrides:
+        key, _, value = word.partition("=")
+        if key == "import":  # Hydra's notes have a list with quotes
+            words += [f"import={name}" for name in yaml.safe_load(value)]
+        elif frames is None or key != "frames":
+            words.append(word)
+    words += [] if frames is None else [f"frames={frames}"]
+    return shlex.join([*PROGRAM.split(), *words])

@@ -59,8 +59,6 @@ class MLflowLogger(MLFlowLogger):
         ModuleNotFoundError: If MLflow is not installed.
     """
 
-    needed_extra = ("mlflow", "mlflow")
-
     def __init__(self, exp_name: Text, tracking_uri: Text, log_dir: str) -> None:
         self._mlflow = import_extra("mlflow", extra="mlflow")
         self._directory = Path(log_dir)
@@ -96,8 +94,6 @@ class WandbLogger(TorchRLWandbLogger):
     Raises:
         ModuleNotFoundError: If wandb is not installed.
     """
-
-    needed_extra = ("wandb", "wandb")
 
     def __init__(
         self, exp_name: Text, project: Text, offline: bool, log_dir: str, **kwargs: Any

@@ -90,7 +90,8 @@ def train(
         FileExistsError: If the folder of a new run holds one.
         Exception: Of any type; `is_expected` tells whether the message is enough for the user.
     """
-    run, say = Run(directory), _print if program else _ignore
+    # Python shows the outcome of the run that is returned
+    run, say = Run(directory), _print if program else lambda line: None
     hydra = _complete(config, run)
     again = _command_again(run, config, program)
     with _named_memory(config), _removed_unless_begun(run), lock_folder(run.lock_file):
@@ -98,7 +99,8 @@ def train(
             done = f"{run.directory} has its {config.frames:,} frames already"
             print(f"{done}: raise 'frames' to train on.")
             is_constrained = config.algo.get("constrained") is not False
-            stopped, length = None, _episode_length(config, run)
+            with closing(make_env(robot_of(run, _plain(config.env)), num_envs=1)) as env:
+                stopped, length = None, env.max_episode_steps
         else:
             if not continues:
                 _check_is_free(run, again, "hydra.run.dir" if program else "directory")
@@ -349,11 +351,6 @@ def _write_notes(run: Run, config: DictConfig, hydra: DictConfig) -> None:
             OmegaConf.save(content, unfinished)
 
 
-def _episode_length(config: DictConfig, run: Run) -> int:
-    with closing(make_env(robot_of(run, _plain(config.env)), num_envs=1)) as env:
-        return env.max_episode_steps
-
-
 def _is_to_be_certified(
     run: Run, config: DictConfig, length: int, is_constrained: bool, say: Callable[[str], None]
 ) -> bool:
@@ -403,7 +400,3 @@ def _print(line: str) -> None:
     except OSError:
         # Python would flush the buffered line again at exit, and change the exit status
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-
-
-def _ignore(line: str) -> None:
-    """For Python, where the run that is returned shows its outcome."""

@@ -125,21 +125,6 @@ def test_refusals_name_the_key_and_what_it_may_hold(path, value, words):
     assert words in outcome(config_of("ppo_lagrangian"), path, value)
 
 
-@pytest.mark.parametrize(
-    ("path", "target", "extra"),
-    [
-        ("logger", "safe_rl.runs.loggers.WandbLogger", "wandb"),
-        ("logger", "safe_rl.runs.loggers.MLflowLogger", "mlflow"),
-        ("collector", "safe_rl.collectors.make_ray_collector", "ray"),
-    ],
-)
-def test_missing_extras_are_named_before_anything_is_built(monkeypatch, path, target, extra):
-    monkeypatch.setattr("safe_rl.extras.find_spec", lambda name: None)
-    words = outcome(config_of("ppo"), path, {"_target_": target})
-    assert words.startswith(f"{path}: This needs the package '{extra}'")
-    assert words.endswith(f"[{extra}]'")
-
-
 def test_whole_numbers_may_be_written_with_exponents():
     config = config_of("ppo").copy()
     config.frames, config.policy_update.num_passes = 3e5, 1e1
