@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from difflib import SequenceMatcher
 from typing import Any
 
-BEHAVIOUR = "behaviour_log_prob"
-"""Log-density of an action, [...], under the policy that took it."""
 STEPS_TAKEN = "steps_taken"
 """Key below "next": the number of environment steps that an action was held for, [..., 1]."""
 

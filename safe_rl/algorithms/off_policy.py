@@ -119,16 +119,13 @@ class OffPolicy(Resumable, Algorithm):
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
             example=env.fake_tensordict(),
-            with_later=loss.retrace is not None,
             **others,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
         return cls(
-            policy=exploring(
-                networks["actor"], env, config.exploration.noise, loss.retrace is not None
-            ),
+            policy=exploring(networks["actor"], env, config.exploration.noise),
             networks=networks,
             constraints=constraints,
             multiplier=multiplier,
@@ -261,12 +258,10 @@ def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
     )
 
 
-def exploring(
-    actor: TensorDictModuleBase, env: EnvBase, noise: float, is_scored: bool = False
-) -> ExploringPolicy:
+def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
     """The exploring policy of an actor, within the bounds of an environment's actions."""
     spec = bounded_actions(env)
-    return ExploringPolicy(actor, spec.low, spec.high, noise=noise, is_scored=is_scored)
+    return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
 
 
 def build_networks(

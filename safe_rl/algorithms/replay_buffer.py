@@ -43,9 +43,6 @@ class Memory(Checked):
         reward_gamma: Discount per step of these sums.
         gammas: Discounts of some of them, which replace ``reward_gamma``, by entry.
         n_steps: Number n of steps that a transition spans (n-step returns).
-        with_later: Whether transitions span one step, and those of minibatches have the n − 1 steps
-            after it as ``later`` [B, n − 1], for losses that correct n-step returns. ``follows``
-            [B, n − 1, 1] is false from the end of the episode, or of the batch [N, T], on.
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
@@ -86,7 +83,6 @@ class Memory(Checked):
         keep: bool,
         device: torch.device | str | None = None,
         example: TensorDictBase | None = None,
-        with_later: bool = False,
     ) -> None:
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self._example = None if example is None else example.to("meta")
@@ -97,7 +93,7 @@ class Memory(Checked):
             sampler=_sampler(capacity, prioritised),
         )
         keys_of: dict[float, list[NestedKey]] = {}
-        for key in reward_keys if n_steps > 1 and not with_later else ():
+        for key in reward_keys if n_steps > 1 else ():
             keys_of.setdefault((gammas or {}).get(key, reward_gamma), []).append(key)
         # its default done_keys keep `terminated` of the first step, so that values would be
         # bootstrapped beyond an end within the n steps
@@ -105,9 +101,7 @@ class Memory(Checked):
             MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
             for gamma, keys in keys_of.items()
         ]
-        self._later = n_steps - 1 if with_later else 0
         self._spanned = ["steps_to_next_obs"] if self._sums else []
-        self._spanned += ["row_ends"] if self._later else []
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -115,10 +109,6 @@ class Memory(Checked):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the steps [N, T] that follow those of the last call."""
-        if self._later:
-            ends = batch["next", "done"].clone()
-            ends[..., -1, :] = True
-            batch = batch.copy().set("row_ends", ends)
         self._add(self._summed(batch) if self._sums else [batch])
 
     def _add(self, pieces: list[TensorDictBase]) -> None:
@@ -167,22 +157,11 @@ class Memory(Checked):
 
         Uniform samples of several minibatches are gathered together, in a tenth of the time.
         """
-        size = self.batch_size * (1 + self._later)
-        at_once = 1 if self.is_prioritised else max(1, _MOST_AT_ONCE // size)
+        at_once = 1 if self.is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
         for first in range(0, number, at_once):
             count = min(at_once, number - first)
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
-            yield from (self._with_later(drawn) if self._later else drawn).split(self.batch_size)
-
-    def _with_later(self, drawn: TensorDictBase) -> TensorDictBase:
-        """Add the steps after those drawn [B]; rows are stored one after the other."""
-        index = drawn["index"].cpu()[:, None] + torch.arange(1, 1 + self._later)
-        # what lies beyond the newest transition is behind an end
-        places = (index % self.capacity).clamp_max(len(self) - 1)
-        later = self._buffer[places.flatten()].reshape(index.shape)
-        ends = torch.cat([drawn["row_ends"][:, None], later["row_ends"][:, :-1]], 1)
-        later["follows"] = ends.logical_not().cumprod(1).bool()
-        return drawn.set("later", later)
+            yield from drawn.split(self.batch_size)
 
     def learned(self, minibatch: TensorDictBase, priority: NestedKey | None = "td_error") -> None:
         """Set the priorities of a minibatch by the TD errors that a loss has written into it."""

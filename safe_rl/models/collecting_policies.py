@@ -8,12 +8,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor
-from torch.nn.functional import softplus
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal
 
 from safe_rl.models.networks import Chain
-from safe_rl.naming import BEHAVIOUR, STEPS_TAKEN
+from safe_rl.naming import STEPS_TAKEN
 
 
 def make_behaviour(actor: ProbabilisticTensorDictSequential) -> TensorDictModuleBase:
@@ -85,7 +84,6 @@ class ExploringPolicy(TensorDictModuleBase):
         high: Upper bounds of the action, [A].
         noise: Standard deviation of the noise of a deterministic actor, as a fraction of half the
             action's range.
-        is_scored: Whether to write the log-density of a Gaussian actor's actions, too.
 
     Attributes:
         is_random: Whether actions are uniformly random. It is a buffer, so the workers of a
@@ -114,16 +112,13 @@ class ExploringPolicy(TensorDictModuleBase):
         high: Tensor,
         *,
         noise: float = 0.0,
-        is_scored: bool = False,
     ) -> None:
         super().__init__()
-        self._is_scored = is_scored
         self._samples = isinstance(actor, ProbabilisticTensorDictSequential)
         network, sampler = (actor.module[0], actor.module[-1]) if self._samples else (actor, actor)
         self.network, self.noise = network.module, noise
         # of a sampler, the log-probability comes second
         self.in_keys, self.out_keys = list(network.in_keys), list(sampler.out_keys[:1])
-        self.out_keys += [BEHAVIOUR] if is_scored else []
         device = next(actor.parameters()).device
         for name, value in (("low", low), ("high", high), ("is_random", torch.tensor(False))):
             self.register_buffer(name, value.to(device), persistent=False)
@@ -137,8 +132,6 @@ class ExploringPolicy(TensorDictModuleBase):
             loc, scale = outputs
             inner = torch.addcmul(loc, scale, torch.randn_like(loc)) if is_noisy else loc
             action = self.low + half * (1 + inner.tanh())
-            if self._is_scored:
-                tensordict.set(BEHAVIOUR, self._log_density(inner, loc, scale, half))
         elif is_noisy and self.noise:
             action = outputs + self.noise * half * torch.randn_like(outputs)
             action = action.clamp(self.low, self.high)
@@ -148,13 +141,6 @@ class ExploringPolicy(TensorDictModuleBase):
             uniform = self.low + 2 * half * torch.rand_like(action)
             action = torch.where(self.is_random, uniform, action)
         return tensordict.set(self.out_keys[0], action)
-
-    def _log_density(self, inner: Tensor, loc: Tensor, scale: Tensor, half: Tensor) -> Tensor:
-        """Log-density [...] of actions whose values before the tanh are `inner`, [..., A]."""
-        slope = 2 * (math.log(2) - inner - softplus(-2 * inner))
-        normal = -0.5 * ((inner - loc) / scale).square() - scale.log() - 0.5 * math.log(2 * math.pi)
-        uniform = -(2 * half).log()
-        return torch.where(self.is_random, uniform, normal - slope - half.log()).sum(-1)
 
 
 class HeldActions(TensorDictModuleBase):

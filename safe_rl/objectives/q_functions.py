@@ -54,11 +54,9 @@ class ReplayLoss(Checked, SharesTensors):
 
     Attributes:
         risk_measure: Class of risk measure that the cost critics estimate; None for means only.
-        retrace: λ of Retrace(λ), for which minibatches need later steps; None: no correction.
     """
 
     risk_measure: type | None = None
-    retrace: float | None = None
 
     @property
     def priority_key(self) -> NestedKey | None:

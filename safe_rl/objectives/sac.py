@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import torch
 from annotated_types import Interval
 from pydantic import FiniteFloat
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl import objectives
@@ -17,10 +16,8 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import ValueEstimators
 
 from safe_rl.checks import Share
-from safe_rl.naming import BEHAVIOUR
 from safe_rl.objectives.cost_critics import CostCritics
 from safe_rl.objectives.q_functions import Distance, QFunctionLoss, check_ensemble
-from safe_rl.objectives.samples import require
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
@@ -36,8 +33,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         fixed_alpha: Whether the entropy coefficient α is constant.
         loss_function: Loss of the TD errors.
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
-        retrace: λ of Retrace(λ), which corrects n-step returns: they end where the policy would not
-            have acted so. It reads ``later`` steps [B, n − 1], see `safe_rl.algorithms.Memory`.
 
     Examples:
         >>> import torch
@@ -61,9 +56,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         fixed_alpha: bool = False,
         loss_function: Distance = "l2",
         action_spec: TensorSpec | None = None,
-        retrace: Share | None = None,
     ) -> None:
-        self.retrace = retrace  # the base's constructor makes in_keys
         check_ensemble(qvalue_network, "Q function of rewards")
         super().__init__(
             actor_network,
@@ -78,47 +71,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
         self.out_keys = ["loss_qvalue", "loss_actor", "loss_alpha", "alpha", "entropy"]
-
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys = [*self._in_keys, *([] if self.retrace is None else [BEHAVIOUR])]
-
-    def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
-        """Losses of the Q functions of rewards."""
-        if self.retrace is not None:
-            self._correct(tensordict)
-        return super().critic_losses(tensordict)
-
-    @torch.no_grad()
-    def _correct(self, tensordict: TensorDictBase) -> None:
-        """Add the weighted TD errors of the later steps to reward and costs of steps [B].
-
-        With them, the targets of TD(0) are those of Retrace(λ) (Munos et al. 2016, equations 3 and
-        4): a weight is the product of γ λ min(1, π / μ) of the later actions, where μ is the policy
-        that took them.
-        """
-        later = require(tensordict, "later")
-        steps = later.reshape(-1)
-        inputs = steps.select(*self.actor_network.in_keys)
-        action = require(steps, self.tensor_keys.action)
-        log_ratio = self.actor_network.get_dist(inputs).log_prob(action) - steps[BEHAVIOUR]
-        kept = self.retrace * later["follows"].squeeze(-1)
-        kept = kept * log_ratio.clamp_max(0).exp().reshape(later.shape)
-        for key, (gamma, errors) in self._later_errors(steps).items():
-            weights = (gamma * kept).cumprod(-1)
-            added = (weights * errors.reshape(later.shape)).sum(-1, keepdim=True)
-            tensordict.set(("next", key), self.column(tensordict, key) + added)
-
-    def _later_errors(self, steps: TensorDictBase) -> dict[NestedKey, tuple[float, Tensor]]:
-        """Discounts, and TD errors [M, 1] of the target networks, of steps [M], by reward key."""
-        keys = self.tensor_keys
-        following = self._next_values(steps["next"]) * self._goes_on(steps)
-        values = self.q_values("qvalue_network", steps, steps.get(keys.action), "target")
-        errors = self.column(steps, keys.reward) + self.gamma * following - values.min(0).values
-        return {keys.reward: (self.gamma, errors)}
-
-    def _goes_on(self, steps: TensorDictBase) -> Tensor:
-        return self.column(steps, self.tensor_keys.terminated).logical_not()
 
     def _next_values(self, following: TensorDictBase) -> Tensor:
         """Values of the next states, with their entropy."""
@@ -177,19 +129,3 @@ class SACLagrangianLoss(CostCritics, SACLoss):
         losses = super().critic_losses(tensordict)
         loss = self.cost_qvalue_loss(tensordict, self._next_action)
         return losses.set("loss_cost_qvalue", loss)
-
-    def _later_errors(self, steps: TensorDictBase) -> dict[NestedKey, tuple[float, Tensor]]:
-        """Discounts and TD errors also of the costs."""
-        found = super()._later_errors(steps)
-        given = (steps["next"], self._next_action), (steps, steps.get(self.tensor_keys.action))
-        following, values = (
-            self.bounded(self.cost_values.mean(self.values_of_costs(*each, "target"))).mean(0)
-            for each in given
-        )
-        costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
-        errors = costs + self.cost_gamma * self._goes_on(steps) * following - values
-        columns = errors.unsqueeze(-1).unbind(-2)
-        return found | {
-            key: (self.cost_gamma, column)
-            for key, column in zip(self.cost_keys, columns, strict=True)
-        }

@@ -97,7 +97,6 @@ _SILENT: dict[str, Hashable] = {
     "env.physics_buffers": 2.0,
     "env.observe_privileged": False,
     "loss.cost_gamma": None,
-    "loss.retrace": None,
     "model.critic_observes": ("observation",),
 }
 

@@ -50,23 +50,6 @@ def all_of(memory):
     return {o: drawn[i] for i, o in enumerate(drawn["observation"].flatten().tolist())}
 
 
-def test_later_steps_are_those_of_the_row_up_to_its_end():
-    memory = make_memory(n_steps=4, with_later=True, capacity=23)
-    for first in (0, 6, 12):  # the last batch overwrites the oldest transitions
-        memory.extend(make_batch(first, 6, ends=[8]))
-    drawn = torch.cat(list(memory.minibatches(20)))
-    assert len(drawn["observation"].unique()) == 23
-    time, follows = drawn["observation"].squeeze(-1) % 1000, drawn["later", "follows"].squeeze(-1)
-    last = torch.where((time > 5) & (time < 9), 8, time // 6 * 6 + 5)
-    assert torch.equal(follows.sum(1), (last - time).clamp_max(3).long())
-    expected = drawn["observation"] + torch.arange(1, 4)
-    assert torch.equal(drawn["later", "observation"].squeeze(-1)[follows], expected[follows])
-    other = make_memory(n_steps=4, with_later=True, capacity=23)
-    other.load_state_dict(memory.state_dict())
-    states = [torch.manual_seed(0) and next(one.minibatches(1)) for one in (memory, other)]
-    assert (states[0] == states[1]).all()
-
-
 def test_transitions_come_back_as_they_went_in():
     memory = make_memory()
     memory.extend(make_batch(0, 5))

@@ -81,17 +81,6 @@ def test_it_samples_the_distribution_of_a_squashed_actor():
         torch.testing.assert_close(ours, theirs, atol=0.02 * spread[column].item(), rtol=0)
 
 
-def test_it_scores_its_actions():
-    actor, batch = make_squashed_actor(5, LOW, HIGH, hidden_sizes=[8]), observations(50)
-    explorer = ExploringPolicy(actor, LOW, HIGH, is_scored=True)
-    step = explorer(batch.clone())
-    expected = actor.get_dist(batch).log_prob(step["action"])
-    torch.testing.assert_close(step["behaviour_log_prob"], expected, rtol=1e-3, atol=1e-3)
-    explorer.is_random.fill_(True)
-    uniform = -(HIGH - LOW).log().sum()
-    torch.testing.assert_close(explorer(step)["behaviour_log_prob"], uniform.expand(50))
-
-
 def test_it_adds_noise_to_a_deterministic_actor_within_bounds():
     network, key = make_bounded_actor(5, LOW, HIGH, hidden_sizes=[8]).module, ("agents", "action")
     actor = TensorDictModule(network, [("agents", "observation")], [key])

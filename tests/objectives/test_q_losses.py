@@ -75,44 +75,6 @@ def lagrange(*values):
     return LagrangeMultiplier(dict(zip(COSTS, (25.0, 10.0), strict=True)), init=values, lr=0.05)
 
 
-def test_retrace_is_its_published_sum():
-    """Munos et al. 2016, equation 3, in a loop over steps."""
-    loss = make_loss("sac", lagrange(1.0, 1.0), retrace=0.9, cost_gamma=0.8)
-    steps, later = make_steps(4), make_steps(12).reshape(4, 3)
-    later["next", "terminated"][0, 1] = True
-    later["behaviour_log_prob"] = 2 * torch.randn(4, 3) - 1
-    later["follows"] = torch.tensor([[1, 1, 0], [1, 1, 1], [0, 0, 0], [1, 1, 1]]).bool()[..., None]
-    steps["later"], rewards = later, {key: steps["next", key].clone() for key in ("reward", *COSTS)}
-    torch.manual_seed(0)
-    action, log_prob = (x.detach() for x in loss._act(later.reshape(-1)["next"]))
-    torch.manual_seed(0)
-    loss._correct(steps)
-    dist = loss.actor_network.get_dist(later)
-    ratios = (dist.log_prob(later["action"]) - later["behaviour_log_prob"]).exp().detach()
-    goes_on = later["next", "terminated"].logical_not().squeeze(-1)
-    action, log_prob = action.reshape(4, 3, 2), log_prob.reshape(4, 3)
-
-    def values(at, action, column):
-        if column == 0:
-            return loss.q_values("qvalue_network", at, action, "target").min(0).values.squeeze(-1)
-        found = loss.values_of_costs(at, action, "target").squeeze(0)
-        return found[..., column - 1].mean(0)
-
-    for column, key in enumerate(("reward", *COSTS)):
-        gamma = 0.8 if column else 0.9
-        bonus = 0.0 if column else 0.2 * log_prob
-        following = values(later["next"], action, column) - bonus
-        errors = later["next", key].squeeze(-1) + gamma * goes_on * following
-        errors = errors - values(later, later["action"], column)
-        for row in range(4):
-            expected, weight = rewards[key][row].clone(), 1.0
-            for time in range(3):
-                weight *= gamma * 0.9 * min(1.0, ratios[row, time].item())
-                weight *= later["follows"][row, time].item()
-                expected += weight * errors[row, time].detach()
-            torch.testing.assert_close(steps["next", key][row], expected)
-
-
 def as_stock(loss, kind):
     """TorchRL's own loss, with vmap, on the same weights."""
     actor = loss.actor_network

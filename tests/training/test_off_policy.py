@@ -57,7 +57,6 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
         ["algo=sac_lagrangian", "memory.capacity=300", "limits=null"],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
         ["algo=wcsac", "risk.window=9"],
-        ["algo=sac_lagrangian", "loss.retrace=1", "memory.n_steps=4"],
         ["algo=cal", "lagrangian=pid"],
         ["algo=td3_lagrangian", "memory.prioritised={alpha: 0.6, beta: 0.4}"],
     ],
