@@ -52,6 +52,16 @@ def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, m
     assert (run / "evaluation.transitions" / "00000000.pt").exists()
 
 
+def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "00000003.pt").touch()
+    (run / "evaluation.transitions").symlink_to(mine)
+    assert main([str(run), "record=true", "episodes=1"]) == 1
+    assert "evaluation.transitions is a link" in capsys.readouterr().err
+    assert (mine / "00000003.pt").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "places"),
     [
