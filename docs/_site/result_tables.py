@@ -260,7 +260,11 @@ def coverage() -> str:
     """What each environment of the benchmark has: seeds × million steps of finished runs."""
     own = ("algorithms", "doggo", *_THREE_MILLION)
     found = pandas.concat([runs(name).query("name == ''").assign(what="own") for name in own])
-    others = {"held_actions": "`preset=hard_tasks`", "paper_preset": "paper's settings"}
+    others = {
+        "held_actions": "`preset=hard_tasks`",
+        "privileged": "`preset=privileged`",
+        "paper_preset": "paper's settings",
+    }
     found = pandas.concat([found, *(runs(name).assign(what=what) for name, what in others.items())])
     found = found[[run.is_finished for run in found.run]]
     shown = [*ALGORITHMS, "sac_lagrangian", "td3_lagrangian"]
