@@ -20,6 +20,7 @@ from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.slates import paper_table
 from safe_rl.scores.benchmark import ALGORITHMS
+from safe_rl.scores.bounds import rounded_up
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT, SPAN, MILLION = 25.0, 20_000, 1_000_000
@@ -199,7 +200,7 @@ def single(campaign: str) -> str:
         )
         if told.get("certified"):
             bound = told["bounds"]["mean_cost"]["bound"]
-            row["bound"] = f"≤ {bound:.1f} at {told['episode_return']:.1f}"
+            row["bound"] = f"≤ {rounded_up(bound):.1f} at {told['episode_return']:.1f}"
         rows.append(row)
     named = ("one_transform", "push", "doggo", "privileged_trials")
     settings = ["name"] if campaign in named else []

@@ -191,6 +191,8 @@ def _nodes(place: Path | str, group: Any) -> dict[str, Any]:
 
 
 def _values(place: Path | str, node: Any) -> np.ndarray:
+    if not hasattr(node, "nbytes"):  # a group, or the name of a type
+        raise ValueError(f"{place}: its {printable(node.name or 'entry')} is no array.")
     if node.nbytes > _MEMORY:
         raise ValueError(
             f"{place}: an array has the shape {node.shape}, which does not fit into the memory."

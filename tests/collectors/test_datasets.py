@@ -242,6 +242,10 @@ def foreign(h5py, folder, kind):
             file["rewards"] = h5py.ExternalLink(str(folder / "other.hdf5"), "rewards")
         elif kind == "loop":
             file["rewards"], file["costs2"] = h5py.SoftLink("/costs2"), h5py.SoftLink("/rewards")
+        elif kind == "type":
+            file["rewards"] = np.dtype("f8")
+        elif kind == "group":
+            file.create_group("rewards")
         elif kind == "huge":
             file.create_dataset("rewards", (1 << 40,), "f8", chunks=(1024,))
 
@@ -252,6 +256,7 @@ def foreign(h5py, folder, kind):
         *((kind, "its rewards is in another file") for kind in ("external", "virtual", "linked")),
         ("loop", "cannot be read, is it whole"),
         ("huge", "does not fit into the memory"),
+        *((kind, "its /rewards is no array") for kind in ("type", "group")),
     ],
 )
 def test_files_that_lead_elsewhere_or_never_end_are_refused(kind, told, tmp_path, h5py):

@@ -8,12 +8,11 @@ import torch
 from evaluated_runs import NUM_STEPS, options, skip_without_opengl
 from PIL import Image
 
-from safe_rl.cli import evaluating as command
 from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
 from safe_rl.envs.velocity import VelocityEnv
-from safe_rl.evaluation import video
+from safe_rl.evaluation import measuring, video
 from safe_rl.evaluation.video import FORMATS, video_format
 
 pytestmark = pytest.mark.long
@@ -122,7 +121,7 @@ def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp
         return make_env(*given, **keys)
 
     monkeypatch.setattr(video, "_frame", note)
-    monkeypatch.setattr(command, "maker_of", lambda directory: drawing)
+    monkeypatch.setattr(measuring, "maker_of", lambda directory: drawing)
     picture = str(tmp_path / "episode.webp")
     changes = {"num_envs": 1, "deterministic": deterministic}
     result = evaluate(run, options(episodes=2, picture=picture, **changes))
