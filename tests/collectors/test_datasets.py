@@ -242,10 +242,6 @@ def foreign(h5py, folder, kind):
             file["rewards"] = h5py.ExternalLink(str(folder / "other.hdf5"), "rewards")
         elif kind == "loop":
             file["rewards"], file["costs2"] = h5py.SoftLink("/costs2"), h5py.SoftLink("/rewards")
-        elif kind == "type":
-            file["rewards"] = np.dtype("f8")
-        elif kind == "group":
-            file.create_group("rewards")
         elif kind == "huge":
             file.create_dataset("rewards", (1 << 40,), "f8", chunks=(1024,))
 
@@ -256,13 +252,25 @@ def foreign(h5py, folder, kind):
         *((kind, "its rewards is in another file") for kind in ("external", "virtual", "linked")),
         ("loop", "cannot be read, is it whole"),
         ("huge", "does not fit into the memory"),
-        *((kind, "its /rewards is no array") for kind in ("type", "group")),
     ],
 )
 def test_files_that_lead_elsewhere_or_never_end_are_refused(kind, told, tmp_path, h5py):
     write_hdf5(h5py, tmp_path / "data.hdf5")
     foreign(h5py, tmp_path, kind)
     with pytest.raises(ValueError, match=told):
+        read_hdf5(tmp_path / "data.hdf5")
+
+
+@pytest.mark.parametrize("value", [np.dtype("f8"), None], ids=["type", "group"])
+def test_entries_that_are_no_arrays_are_refused(value, tmp_path, h5py):
+    write_hdf5(h5py, tmp_path / "data.hdf5")
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        del file["next_observations"]
+        if value is None:
+            file.create_group("next_observations")
+        else:
+            file["next_observations"] = value
+    with pytest.raises(ValueError, match="its /next_observations is no array"):
         read_hdf5(tmp_path / "data.hdf5")
 
 
