@@ -62,8 +62,10 @@ def _in_one_thread(work, *arguments):
 def start(*words, limits="", **environment):
     """A process of its own group; `limits` are commands of the shell before it."""
     outside = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    # below nohup and in the background these signals are ignored
+    command = f'{limits} exec env --default-signal=INT,HUP "$@"'
     return subprocess.Popen(
-        ["bash", "-c", f'{limits} exec "$@"', "bash", sys.executable, *words],
+        ["bash", "-c", command, "bash", sys.executable, *words],
         cwd=ROOT, env=outside | environment, start_new_session=True, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip

@@ -145,7 +145,8 @@ def test_changed_files_are_used_or_refused_in_a_line(trained, tmp_path, capfd):
             said = ""
         finally:
             signal.alarm(0)
-        assert len(said.splitlines()) <= 1, said
+        # a report without any run has a line for each that it left out
+        assert len(said.splitlines()) <= 1 + said.startswith("There is no run to report"), said
         assert MARK not in said
         shutil.rmtree(tmp_path / "runs")
     assert mine.read_text() == "mine"
