@@ -167,8 +167,8 @@ class CostCritics(QFunctionLoss):
             ends = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.cost_gamma, spanned) * ends.logical_not()
-        present = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
-        loss = self.cost_errors(present, costs, discount, values).sum(-1).sum(0)
+        predicted = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
+        loss = self.cost_errors(predicted, costs, discount, values).sum(-1).sum(0)
         return self._mean(loss, tensordict)
 
     def cost_errors(

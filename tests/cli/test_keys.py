@@ -96,6 +96,7 @@ def test_no_value_ends_in_a_traceback():
     ("path", "value", "words"),
     [
         ("frames", "abc", "frames=abc: it must be a valid integer"),
+        ("frames", 2.5, "frames=2.5: it must be a valid integer"),
         ("num_envs", 0, "num_envs=0: it must be greater than or equal to 1"),
         ("seed", True, "Value 'True' of type 'bool' could not be converted to Integer"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be less than or equal to 1"),
@@ -104,8 +105,10 @@ def test_no_value_ends_in_a_traceback():
             2,
             "advantage.gama: VectorGAE has no such argument. Did you mean 'gamma'",
         ),
+        ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be greater than 1"),
         ("policy_update.optimizer.lr", -1, "policy_update: Invalid learning rate: -1"),
         ("loss.clip_epsilon", math.nan, "loss.clip_epsilon=nan: it must be a finite number"),
+        ("model.initial_log_std", None, "model.initial_log_std=null: it must be a valid number"),
         ("model.hidden_sizes", 64, "model.hidden_sizes=64: it must be a valid list"),
         (
             "model.hiden_sizes",

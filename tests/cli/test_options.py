@@ -36,10 +36,15 @@ def test_names_stay_as_they_are_written(name):
         ("epsiodes=3", "Unknown option 'epsiodes'. Did you mean 'episodes'?"),
         ("episodes", "'episodes' is not an option: they are written key=value"),
         ("episodes=many", "episodes=many: it must be a valid integer"),
+        ("video=maybe", "video=maybe: it must be a valid boolean"),
         ("episodes=[1", "cannot be read"),
         ("cost_limits={cost: low}", "cost_limits=.*'low'.*a valid number"),
+        ("cost_limits={cost: -1}", "cost_limits=.*-1.* greater than or equal to 0"),
         ("episodes=0", "episodes=0: it must be greater than or equal to 1"),
+        ("num_envs=1000000000", "num_envs=1000000000: .* equal to 100000"),
         ("name=a/b", "name=a/b: .*without /"),
+        ("device=meta", "device=meta: it must be cpu; or cuda"),
+        ("cvar_alpha=nan", "nan"),
     ],
 )
 def test_errors_say_what_to_write(argument, message):
@@ -76,6 +81,14 @@ def test_the_help_has_every_option_and_its_default():
 def test_a_missing_package_names_its_extra():
     with pytest.raises(ModuleNotFoundError, match=r"'no_such_package'.*\.\[video\]"):
         import_extra("no_such_package.part", "video")
+
+
+def test_an_error_within_a_package_is_not_taken_for_its_absence(tmp_path, monkeypatch):
+    (tmp_path / "broken_package.py").write_text("import another_missing_package")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="another_missing_package") as caught:
+        import_extra("broken_package", "video")
+    assert "extra" not in str(caught.value)
 
 
 def test_an_error_cannot_control_the_terminal(capsys):

@@ -98,6 +98,11 @@ def test_epochs_of_few_steps_are_counted_together(tmp_path):
     assert record["regret_cost"] == pytest.approx((50 - 25) / 25)
 
 
+def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
+    write_run(tmp_path, limits={})
+    assert learning_table(experiments_in(tmp_path)) is None
+
+
 def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):
     # batches of 1000 and of 750 steps, until there are at least 2500
     for algo, epochs, frames in (("ppo", 3, 2500), ("cpo", 4, 2500), ("trpo", 2, 2500)):

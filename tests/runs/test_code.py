@@ -40,6 +40,12 @@ def test_the_commit_is_gits_and_a_change_is_told(checkout):
     assert commit_of(module) == (git("rev-parse", "HEAD"), True)
 
 
+def test_a_tag_does_not_stand_for_the_commit(checkout):
+    module, git = checkout
+    git("tag", "--annotate", "v1", "--message=one")
+    assert commit_of(module)[0] == git("rev-parse", "HEAD")
+
+
 def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
     module, _ = checkout
     installed = module.parent / "site-packages" / "module.py"

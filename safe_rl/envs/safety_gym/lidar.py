@@ -31,6 +31,11 @@ def floor_to_ego(xy: Tensor, robot_pos: Tensor, robot_mat: Tensor) -> Tensor:
     return ego.addcmul_(robot_z, along_z, value=-1).movedim(0, -1)
 
 
+def _num_laps(num_bins: int) -> int:
+    """Return how often the circle is repeated in a lidar's cells, so that no bin lies outside."""
+    return 2 if num_bins > 2 else 4
+
+
 def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) -> Tensor:
     """Return the cells of the first bins, in one array for all lidars of all robots.
 
@@ -39,7 +44,7 @@ def lidar_cells(group: Tensor, num_groups: int, num_bins: int, num_robots: int) 
     bin itself, and of the one after. Cells are ordered by robot, then by lidar; each lidar has
     several turns of the circle.
     """
-    laps = 2 if num_bins > 2 else 4  # so that no bin lies outside
+    laps = _num_laps(num_bins)
     robot = torch.arange(num_robots, device=group.device).unsqueeze(1)
     cells = (laps * (num_groups * robot + group) + laps // 2) * num_bins
     return torch.stack([cells, cells + 1, cells + 2])
@@ -85,7 +90,7 @@ def pseudo_lidar(
     else:
         cells = cells[1:2]
     index = (bins.to(torch.int64) + cells).flatten()
-    shape = (len(x), num_groups, 2 if num_bins > 2 else 4, num_bins)  # as in `lidar_cells`
+    shape = (len(x), num_groups, _num_laps(num_bins), num_bins)
     turns = reading.new_zeros(math.prod(shape) + 2)
     turns.scatter_reduce_(0, index, values.flatten(), "amax")
     return reduce(torch.maximum, turns[1:-1].view(shape).unbind(2)).flatten(1)
