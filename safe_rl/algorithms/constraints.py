@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitState, LimitTracker
-from safe_rl.objectives.multipliers import Multiplier
+from safe_rl.objectives.multipliers import Multiplier, parse_cost_limits
 from safe_rl.objectives.risk import PenalisedCosts, RiskMeasure
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
@@ -73,8 +73,9 @@ class Constraints(Resumable):
                 "risk: only the mean cost is limited by the episodes of a batch alone "
                 "(limits=null); other measures need limits, as in conf/algo/cpo.yaml."
             )
-        self.keys, self.cost_limits = list(limits), dict(limits)
-        self.limits = torch.tensor(list(limits.values()), dtype=torch.float32, device=device)
+        self.cost_limits = dict(limits)
+        self.keys, values = parse_cost_limits(limits) if limits else ([], torch.empty(0))
+        self.limits = values.to(device)
         self.tracker, self.risk = tracker, risk
         self.schedule = tracker.schedule if tracker is not None and self.keys else ""
         self._max_length = max_length

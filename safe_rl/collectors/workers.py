@@ -125,15 +125,11 @@ class WorkerCollector:
         device: torch.device | str,
     ) -> None:
         self._num_envs = env.batch_size.numel()
-        if (
-            num_collectors < 1
-            or self._num_envs % num_collectors
-            or frames_per_batch % self._num_envs
-        ):
+        check_batch(frames_per_batch, self._num_envs)
+        if self._num_envs % num_collectors:
             raise ValueError(
-                f"{num_collectors} collectors cannot share {self._num_envs} environments and "
-                f"batches of {frames_per_batch} frames equally: num_envs must be a multiple of "
-                "num_collectors, and frames_per_batch of num_envs."
+                f"{num_collectors} collectors cannot share {self._num_envs} environments equally: "
+                "num_envs must be a multiple of num_collectors."
             )
         self.storing_device = torch.device(device)
         self._first_steps: Tensor | None = None
@@ -221,6 +217,28 @@ class WorkerCollector:
                 scheme.shutdown()
 
 
+def check_batch(frames_per_batch: int, num_envs: int, steps_at_a_time: int = 1) -> None:
+    """Refuse batches that a number of environments cannot share equally.
+
+    Args:
+        frames_per_batch: Steps of all environments together.
+        num_envs: Number of environments.
+        steps_at_a_time: Environment steps per action.
+
+    Raises:
+        ValueError: If the steps are not a positive multiple of those taken together.
+    """
+    together = num_envs * steps_at_a_time
+    if frames_per_batch < 1 or frames_per_batch % together:
+        below = frames_per_batch // together * together
+        nearest = [str(frames) for frames in (below, below + together) if frames > 0]
+        steps = f" that take {steps_at_a_time} steps at a time" if steps_at_a_time > 1 else ""
+        raise ValueError(
+            f"frames_per_batch={frames_per_batch} cannot be shared equally among {num_envs} "
+            f"environments{steps}: use {' or '.join(nearest)}, or another number of environments."
+        )
+
+
 def make_collector(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
@@ -247,15 +265,7 @@ def make_collector(
         >>> next(iter(collector)).shape
         torch.Size([4, 10])
     """
-    num_envs = env.batch_size.numel()
-    if frames_per_batch < 1 or frames_per_batch % num_envs:
-        below = frames_per_batch // num_envs * num_envs
-        nearest = [frames for frames in (below, below + num_envs) if frames > 0]
-        raise ValueError(
-            f"frames_per_batch={frames_per_batch} cannot be shared equally among {num_envs} "
-            f"environments: use {' or '.join(map(str, nearest))}, or another number of "
-            "environments."
-        )
+    check_batch(frames_per_batch, env.batch_size.numel())
     device = env.device if device is None else torch.device(device)
     return Collector(
         env,

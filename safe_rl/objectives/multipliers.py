@@ -13,12 +13,12 @@ from typing import Annotated
 
 import torch
 from annotated_types import Interval
-from pydantic import PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from safe_rl.checks import Checked
+from safe_rl.checks import Checked, check_value
 from safe_rl.objectives.limits import LimitState
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
@@ -38,7 +38,7 @@ def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]
         are named ``cost`` (one) or ``cost_0``, ``cost_1``, … (several).
 
     Raises:
-        ValueError: If there is no limit at all, or one that is not a finite number.
+        ValueError: If there is no limit at all, or one that is below 0 or not a finite number.
     """
     keys: list[NestedKey]
     if isinstance(cost_limits, Mapping):
@@ -51,10 +51,8 @@ def parse_cost_limits(cost_limits: CostLimits) -> tuple[list[NestedKey], Tensor]
             "cost_limits is empty: give at least one limit, for example {'cost': 25.0}; "
             "an unconstrained algorithm takes multiplier=None instead."
         )
-    limits = torch.as_tensor(values, dtype=torch.float32)
-    if not limits.isfinite().all():
-        raise ValueError(f"cost_limits must be finite numbers, got {values}.")
-    return keys, limits
+    check_value("cost_limits", list[NonNegativeFloat], values)
+    return keys, torch.tensor(values, dtype=torch.float32)
 
 
 def per_cost(name: str, value: float | Sequence[float] | Tensor, num_costs: int) -> Tensor:

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm, find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
-from safe_rl.collectors.workers import MakeEnv
+from safe_rl.collectors.workers import MakeEnv, check_batch
 from safe_rl.runs.checkpoints import check_interface, read_states
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
@@ -117,15 +117,8 @@ def _check_memory(config: DictConfig, env: EnvBase) -> None:
 
 def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
     """Decisions of all environments together in a batch; ``frames_per_batch`` counts steps."""
-    frames, together = config.frames_per_batch, env.batch_size.numel() * env.steps_per_decision
-    if env.steps_per_decision != 1 and frames % together:
-        below = frames // together * together
-        raise ValueError(
-            f"frames_per_batch={frames}: {env.batch_size.numel()} environments that take "
-            f"{env.steps_per_decision} steps at a time take {together} together. Use "
-            f"{below or together} or {below + together}, or another number of environments."
-        )
-    return frames // env.steps_per_decision
+    check_batch(config.frames_per_batch, env.batch_size.numel(), env.steps_per_decision)
+    return config.frames_per_batch // env.steps_per_decision
 
 
 def begin_from(

@@ -234,3 +234,8 @@ def test_another_default_dtype_of_torch_changes_nothing():
         states.append([v for v in vars(state).values() if v is not True] + [multiplier.value])
     assert all(map(torch.equal, *states))
     assert all(value.dtype == torch.float32 for value in states[1])
+
+
+def test_a_loop_of_ones_own_is_told_of_a_limit_below_zero():
+    with pytest.raises(ValueError, match=r"cost_limits=.*greater than or equal to 0"):
+        Constraints({"cost": -1.0})

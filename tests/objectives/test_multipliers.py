@@ -98,6 +98,7 @@ def test_limits_keep_their_keys(limits, keys):
     [
         (lambda: lagrange({}), "multiplier=None"),
         (lambda: lagrange([math.inf]), "finite"),
+        (lambda: lagrange([-1.0]), "greater than or equal to 0"),
         (lambda: lagrange(init=0.0), "greater than 0"),
         (lambda: lagrange([1.0, 2.0], init=[1.0, 1.0, 1.0]), "2 numbers"),
         (lambda: lagrange([1.0, 2.0]).update(limit_state(1.0)), "each of"),
