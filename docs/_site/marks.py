@@ -48,7 +48,8 @@ def columns(names: str) -> str:
         for name in names.split()
     ]
     rows = [row for table in tables for row in table.splitlines()[2:]]
-    return "\n".join(["| column | meaning |", "|---|---|", *rows])
+    head = "| column, besides [those of every run](columns.md#every-algorithm) | meaning |"
+    return "\n".join([head, "|---|---|", *rows])
 
 
 TABLES: dict[str, Callable[..., str]] = {
