@@ -12,7 +12,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 
 from safe_rl.cli import train
-from safe_rl.cli.composing import check_risk, compose_run
+from safe_rl.cli.composing import compose_run
 from safe_rl.cli.config import check_settings
 
 ROOT = Path(__file__).parents[1]
@@ -48,7 +48,6 @@ def composed(*words: str) -> list[DictConfig]:
     configs = [compose_run(job, folders, *names) for job in jobs[:2] + jobs[2:][-2:]]
     for config in configs:
         check_settings(config)
-        check_risk(config)
     return configs
 
 

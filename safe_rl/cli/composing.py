@@ -32,9 +32,9 @@ from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.extras import hint_of_plugin
-from safe_rl.files import CONF, PROGRAM, read_config
+from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean
-from safe_rl.runs.identity import flatten, role_of
+from safe_rl.runs.identity import differences, flatten
 from safe_rl.runs.run import Run
 
 _MOST_LISTED = 40
@@ -228,23 +228,6 @@ def _foreign_key(file: str, section: str, key: str) -> str:
     return f"{'='.join(file.rsplit('/', 1))} sets '{key}', which {section} does not have.{where}"
 
 
-def check_risk(config: DictConfig) -> None:
-    """Refuse a risk measure that neither the algorithm nor a transform would use."""
-    measure = (config.get("risk") or {}).get("_target_")
-    is_constrained = config.algo.get("constrained") is not False
-    if measure is not None and not is_to_keep_limits(config, is_constrained):
-        raise ValueError(
-            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
-            "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
-        )
-
-
-def is_to_keep_limits(config: DictConfig, is_constrained: bool) -> bool:
-    """Whether the algorithm keeps limits, or a transform gives every episode a cost budget."""
-    transforms = (config.get("transforms") or {}).values()
-    return is_constrained or any("budgets" in transform for transform in transforms)
-
-
 def read_resumed(
     directory: Path, modules: Sequence[str] | None, words: Sequence[str]
 ) -> dict[str, Any]:
@@ -313,15 +296,14 @@ def refuse_changes(directory: Path, config: DictConfig) -> None:
     Raises:
         ValueError: If there is such a key; the message names it.
     """
-    before = flatten(read_config(Run(directory).config_file))
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    now = flatten(OmegaConf.to_container(settings, resolve=True))  # type: ignore[arg-type]
-    for key in sorted({*before, *now}):
-        if before.get(key) != now.get(key) and not role_of(key).may_change:
-            raise ValueError(
-                f"{key}={now.get(key)} cannot change in a run that is continued (it was "
-                f"{before.get(key)}). You may change frames, keys of the machine such as "
-                "checkpoint.interval, and single numbers below loss, limits, policy_update and so "
-                "on, but not an optimiser's lr: the checkpoint has it. For a new run from this "
-                f"run's networks use {quote(f'init_from={quote(str(directory))}')}."
-            )
+    given: Any = OmegaConf.to_container(settings, resolve=True)
+    changed = differences(Run(directory).settings, given, "may_change")
+    for key, (before, now) in changed.items():
+        raise ValueError(
+            f"{key}={now} cannot change in a run that is continued (it was {before}). You may "
+            "change frames, keys of the machine such as checkpoint.interval, and single numbers "
+            "below loss, limits, policy_update and so on, but not an optimiser's lr: the "
+            "checkpoint has it. For a new run from this run's networks use "
+            f"{quote(f'init_from={quote(str(directory))}')}."
+        )

@@ -22,7 +22,7 @@ from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, Positi
 from safe_rl.checks import SettingError, Text, check_value, rule
 from safe_rl.evaluation.settings import CertificateOptions, Device
 from safe_rl.naming import join_keys, nearest
-from safe_rl.runs.identity import flatten
+from safe_rl.runs.identity import flatten, is_to_keep_limits
 
 
 def typed(kind: Any) -> GetPydanticSchema:
@@ -224,6 +224,12 @@ def _check_all(config: DictConfig) -> None:
         raise SettingError(
             "collector.num_collectors: collector=local is one process; for more use "
             "collector=process or collector=ray."
+        )
+    measure = (config.get("risk") or {}).get("_target_")
+    if measure is not None and not is_to_keep_limits(config):
+        raise SettingError(
+            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
+            "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
         )
     if (cap := config.certificate.get("cap")) is not None:
         from safe_rl.scores.certificate import Claim  # it imports SciPy

@@ -73,7 +73,7 @@ def evaluate_varied(
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
     from safe_rl.evaluation.policies import writable_copy
-    from safe_rl.training.train import certify_run
+    from safe_rl.training.finish import certify_run
 
     names = ("certify", "certificate", "deterministic", "num_threads")
     read = {name: getattr(options, name) for name in names}

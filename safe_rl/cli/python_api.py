@@ -17,14 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
 from safe_rl.cli.composing import (
     RESUMED,
-    check_risk,
     compose_run,
     overrides_of,
     read_resumed,
@@ -45,7 +44,8 @@ from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
-from safe_rl.training.train import Callback, certify_run
+from safe_rl.training.finish import certify_run
+from safe_rl.training.train import Callback
 
 if TYPE_CHECKING:
     import pandas
@@ -106,7 +106,6 @@ def train(
     more = {"import": modules} if modules else {}
     config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
     check_settings(config)
-    check_risk(config)
     folder = new_folder(config.hydra) if directory is None else Path(directory).expanduser()
     return _carry_out(config, folder, callbacks)
 
@@ -170,8 +169,11 @@ def new_folder(hydra: DictConfig) -> Path:
 def _carry_out(
     config: DictConfig, folder: Path, callbacks: Sequence[Callback], *, continues: bool = False
 ) -> Run:
+    with open_dict(config):
+        hydra = config.pop("hydra")
+    options: dict[str, Any] = {"continues": continues, "callbacks": callbacks, "program": None}
     try:
-        training.train(config, folder, continues=continues, callbacks=callbacks, program=None)
+        training.train(config, folder, hydra=None if continues else hydra, **options)
     except SystemExit as end:
         if end.code == 128 + SIGINT:
             raise KeyboardInterrupt from None

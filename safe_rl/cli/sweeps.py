@@ -19,14 +19,15 @@ from hydra.conf import HydraConf
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig
 
-from safe_rl.cli.composing import check_risk, name_choices
+from safe_rl.cli.composing import name_choices
 from safe_rl.cli.config import check_settings
 from safe_rl.cli.user_code import import_modules
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
-from safe_rl.runs.outcome import LINE_SECONDS
+from safe_rl.runs.identity import check_same_run
+from safe_rl.runs.outcome import LINE_SECONDS, violation
 from safe_rl.runs.run import Run
 
 _GRACE = 30.0
@@ -46,29 +47,46 @@ def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> fl
     Returns:
         The value that an optimising sweeper maximises; −∞ if the job fails.
     """
-    from safe_rl.training.train import run_job  # with torch: a sweep starts without it
-
-    folder = Run(directory)
+    run = Run(directory)
     _failed.discard(str(directory))
     try:
         import_modules(config.get("import"))
         name_choices(config, settings)
         check_settings(config)
-        check_risk(config)
-        with open_dict(config):
-            config.hydra = settings
-        value = run_job(config, directory)
+        value = run_job(config, settings, run)
     except Exception as error:
         summary = f"{type(error).__name__}: {' '.join(str(error).split())}"
         print(f"{directory}: {summary}", file=sys.stderr)
         _failed.add(str(directory))
         if not isinstance(error, RunInUseError):  # then another process owns the folder
-            folder.directory.mkdir(parents=True, exist_ok=True)
+            run.directory.mkdir(parents=True, exist_ok=True)
             text = "".join(traceback.format_exception(error))
-            replace_text(folder.failure_file, f"{summary}\n\n{text}")
+            replace_text(run.failure_file, f"{summary}\n\n{text}")
         return -math.inf
-    folder.failure_file.unlink(missing_ok=True)
+    run.failure_file.unlink(missing_ok=True)
     return value
+
+
+def run_job(config: DictConfig, settings: HydraConf, run: Run) -> float:
+    """Train the run of a job; a finished one is skipped, an interrupted one goes on.
+
+    Returns:
+        The run's final return, or −∞ if it ends above a limit or no episode has ended.
+
+    Raises:
+        SystemExit: If it is interrupted.
+        ValueError: If its folder holds a run with other settings.
+    """
+    from safe_rl.training.train import complete, train  # with torch: a sweep starts without it
+
+    if run.is_run:
+        complete(config, run)
+        check_same_run(run, config)
+    train(config, run.directory, hydra=settings, continues=True)
+    figures, limits = run.final, run.cost_limits
+    value = figures["episode_return"]
+    is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
+    return -math.inf if is_above or math.isnan(value) else value
 
 
 class Summary(Callback):

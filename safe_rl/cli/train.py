@@ -14,18 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.conf import HydraConf
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.composing import (
     RESUMED,
-    check_risk,
     explain,
     name_choices,
     overrides_of,
@@ -135,32 +133,24 @@ def job(config: DictConfig) -> float | None:
         sys.exit("hydra.run.dir= is empty: it names the folder of the run.")
     is_resumed = settings.job.config_name == RESUMED
     try:
-        _check(config, settings, directory)
+        if is_resumed:
+            refuse_changes(directory, config)
+        else:
+            name_choices(config, settings)
+        check_settings(config)
     except (OmegaConfBaseException, ValueError) as error:
         with suppress(OSError):
             directory.rmdir()  # Hydra has made it; a folder with files stays
         sys.exit(printable(explain(error, sys.argv[1:])))
-    if not is_resumed:
-        with open_dict(config):
-            config.hydra = settings
     from safe_rl.training.train import is_expected, train  # torch: help and errors do not need it
 
     try:
-        train(config, directory, continues=is_resumed)
+        train(config, directory, hydra=None if is_resumed else settings, continues=is_resumed)
     except Exception as error:
         if not is_expected(error):
             raise
         sys.exit(printable(" ".join(str(error).split())))
     return None
-
-
-def _check(config: DictConfig, settings: HydraConf, directory: Path) -> None:
-    if settings.job.config_name == RESUMED:
-        refuse_changes(directory, config)
-    else:
-        name_choices(config, settings)
-    check_settings(config)
-    check_risk(config)
 
 
 @hydra.main(config_path=str(CONF), config_name="config", version_base="1.3")

@@ -95,6 +95,11 @@ def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
     return {**env, "robot_base": str(path)}
 
 
+def node_of(run: Run, config: DictConfig) -> dict[str, Any]:
+    """The environment's node of a run that begins or continues; see `robot_of`."""
+    return robot_of(run, OmegaConf.to_container(config.env, resolve=True))  # type: ignore[arg-type]
+
+
 def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:
     """:func:`safe_rl.make_env` for a run's environments, with the robot that it began with."""
     run = Run(directory)

@@ -24,7 +24,7 @@ from safe_rl.files import read_bounded, read_config, read_json, read_yaml, repla
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
-from safe_rl.runs.identity import config_dirs, differences, repeating, role_of, select
+from safe_rl.runs.identity import config_dirs, differences, repeating, select
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -220,9 +220,8 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     kept = read_archive(archive) if (archive / RUNS).exists() else {}
     names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
     for name in kept.keys() & names:
-        differing = differences(kept[name].settings, names[name].settings)
         # what `resume=` may change makes no other run
-        if changed := [key for key in differing if not role_of(key).may_change]:
+        if changed := differences(kept[name].settings, names[name].settings, "may_change"):
             raise ValueError(
                 f"archive={archive}: its run {name} is another one than that in {root}: they "
                 f"differ in {', '.join(changed)}. Give another folder for these runs."

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
@@ -144,7 +144,7 @@ class CheckpointStore:
         keep_best: Number of best checkpoints to keep.
         run: JSON-compatible facts of the run that every checkpoint holds. A checkpoint with other
             facts is refused when the run is resumed.
-        interface: ``interface`` of the environment, which every checkpoint holds as well.
+        interface: Returns the ``interface`` of the environment, which every checkpoint holds too.
     """
 
     def __init__(
@@ -155,16 +155,15 @@ class CheckpointStore:
         keep_last: int,
         keep_best: int = 1,
         run: Mapping[str, Any] | None = None,
-        interface: Mapping[str, Any] | None = None,
+        interface: Callable[[], Mapping[str, Any]] = dict,
     ) -> None:
-        self._interface = interface
         self.last = Path(directory) / "last"
         self.best = Path(directory) / "best"
         self._components = dict(components)
         # exists until the first checkpoint is written: if both are missing, checkpoints are lost
         self._none_yet = self.last / "none-yet"
         self._keep_last, self._keep_best = keep_last, keep_best
-        self._run = dict(run or {})
+        self._run, self._interface = dict(run or {}), interface
 
     def begin(self) -> None:
         """Note that a run begins and has no checkpoint yet."""
@@ -242,7 +241,7 @@ class CheckpointStore:
     ) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / checkpoint_name(steps)
-        held = {"run": self._run, "interface": self._interface}
+        held = {"run": self._run, "interface": self._interface()}
         facts = {**(facts or {}), **{name: value for name, value in held.items() if value}}
         save_tensors(path, {"facts": facts, "parts": dict(states)})
         return path
@@ -250,8 +249,7 @@ class CheckpointStore:
     def resume(self, epochs: int = 0) -> Path | None:
         """Restore the newest checkpoint; if it is damaged, an older one with a warning.
 
-        Best checkpoints newer than the restored one are removed, and so are unfinished files of a
-        run that was killed while writing.
+        Best checkpoints newer than the restored one are removed.
 
         Args:
             epochs: Rows of the run's table.
@@ -263,9 +261,6 @@ class CheckpointStore:
             CheckpointError: If no checkpoint can be used (the message is about the newest), or if
                 the run has finished epochs and its checkpoints are missing.
         """
-        for kind in (self.last, self.best):
-            for unfinished in kind.glob(".checkpoint-*"):
-                unfinished.unlink()
         failures: list[CheckpointError] = []
         restored = None
         for path in reversed(checkpoints_in(self.last)):

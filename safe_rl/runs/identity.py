@@ -138,8 +138,16 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
     }
 
 
-def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Dotted key -> two values, of keys that differ although a sweep's job may not change them.
+def differences(
+    saved: Mapping[str, Any], given: Mapping[str, Any], allowed: str = "may_differ"
+) -> dict[str, tuple[Any, Any]]:
+    """Dotted key -> two values, of keys that differ although their roles do not allow it.
+
+    Args:
+        saved: Configuration of a run.
+        given: Another one.
+        allowed: The attribute of `Role` that allows a difference: ``may_differ`` for a sweep,
+            ``may_change`` for ``resume=``.
 
     Examples:
         >>> differences({"seed": 0, "frames": 10}, {"seed": 1, "frames": 20})
@@ -149,7 +157,7 @@ def differences(saved: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str,
     return {
         key: (both[0].get(key), both[1].get(key))
         for key in sorted({*both[0], *both[1]})
-        if both[0].get(key) != both[1].get(key) and not role_of(key).may_differ
+        if both[0].get(key) != both[1].get(key) and not getattr(role_of(key), allowed)
     }
 
 
@@ -215,6 +223,13 @@ def check_same_run(run: Run, config: DictConfig) -> None:
             f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
             "the sweep another folder with hydra.sweep.dir=..."
         )
+
+
+def is_to_keep_limits(config: DictConfig) -> bool:
+    """Whether the algorithm keeps limits, or a transform gives every episode a cost budget."""
+    transforms = (config.get("transforms") or {}).values()
+    is_constrained = config.algo.get("constrained") is not False
+    return is_constrained or any("budgets" in transform for transform in transforms)
 
 
 def select(node: Any, *keys: str) -> Any:

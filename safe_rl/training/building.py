@@ -6,7 +6,10 @@ A run can start from the networks of another run (Ray, Achiam, Amodei 2019, sect
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +25,18 @@ from safe_rl.algorithms.algorithm_contract import Algorithm, find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
 from safe_rl.collectors.workers import MakeEnv, check_batch
+from safe_rl.envs import make_env
+from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
+from safe_rl.evaluation.loading import node_of, transforms_of
 from safe_rl.runs.checkpoints import check_interface, read_states
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
 from safe_rl.training.trainer import Evaluator, Trainer
-from safe_rl.trust import instantiate
+from safe_rl.trust import allow, allowed, instantiate
 
 MakeEvaluation = Callable[[TensorDictModuleBase], Evaluator]
 """Makes the periodic evaluation of a policy that is trained."""
-
-
-def physics_threads(config: DictConfig) -> int:
-    """Threads of the physics of each collector; 0 is one per core. Workers divide them."""
-    num_collectors = config.collector.num_collectors
-    if num_collectors == 1:
-        return config.num_threads or 0
-    return max(1, (config.num_threads or os.cpu_count() or 1) // num_collectors)
 
 
 def seed_everything(seed: int, num_threads: int | None) -> None:
@@ -48,6 +46,47 @@ def seed_everything(seed: int, num_threads: int | None) -> None:
         torch.set_num_threads(num_threads)
 
 
+def build_run(config: DictConfig, run: Run) -> Trainer:
+    """Build all parts of a run, with its environments and periodic evaluations."""
+    node, num_collectors = node_of(run, config), config.collector.num_collectors
+    num_threads = config.num_threads or 0  # of physics; 0: one per core
+    if num_collectors > 1:
+        num_threads = max(1, (num_threads or os.cpu_count() or 1) // num_collectors)
+    make = partial(
+        make_env,
+        node,
+        device=config.device,
+        seed=config.seed,
+        num_threads=num_threads,
+        transforms=transforms_of(config),
+    )
+    in_workers = partial(_make_after_imports, allowed(), list(sys.path), make)
+    env = make(num_envs=config.num_envs)
+    evaluation, periodic = None, config.get("evaluation")
+    if periodic is not None:
+        evaluation = partial(
+            periodic_evaluation,
+            partial(make, evaluating=True),
+            cost_keys=env.cost_keys,
+            seed=default_seed(node, config.seed),
+            fixed_layout=has_fixed_layout(node),
+            interval=periodic.interval,
+            episodes=periodic.episodes,
+        )
+    return build_trainer(config, env, run.directory, in_workers, evaluation)
+
+
+def _make_after_imports(
+    modules: Sequence[str], path: list[str], make: MakeEnv, **options: Any
+) -> EnvBase:
+    """Make environments in a worker process, which imports the user's modules first."""
+    sys.path[:] = path
+    for name in modules:
+        import_module(name)
+        allow(name)
+    return make(**options)
+
+
 def build_trainer(
     config: DictConfig,
     env: EnvBase,
@@ -55,7 +94,7 @@ def build_trainer(
     make_env: MakeEnv | None = None,
     make_evaluation: MakeEvaluation | None = None,
 ) -> Trainer:
-    """Build all parts of a run.
+    """Build the parts of a run for an environment.
 
     Args:
         config: Configuration as composed from ``conf/``.

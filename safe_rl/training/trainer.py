@@ -74,25 +74,23 @@ class Trainer:
         )
         self.progress = Progress()
         self.writer = writer
-        self.episode_length = env.max_episode_steps
         self.stopped_by: Signals | None = None
         self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
         self._collector = collector
-        self._env = env
+        self.env = env
         self._evaluation, self._recording = evaluation, recording
         # the environments of workers are in other processes
         self._snapshot = None
         if isinstance(collector, Collector) and env.get_state() is not None:
             self._snapshot = EnvSnapshot(env, collector)
         self._is_continued = False
-        self.interface = env.interface
         self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
         if self._first_steps is not None:
             (self._snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
         self._checkpoint_interval = config.checkpoint.interval
-        self._selection = self._make_selection(config.checkpoint.get("best_over", 1), cost_limits)
+        self._selection = self._make_selection(config.checkpoint.best_over, cost_limits)
         self._checkpoints = self._open_checkpoints(config)
 
     def _open_checkpoints(self, config: DictConfig) -> CheckpointStore:
@@ -101,19 +99,19 @@ class Trainer:
             self.writer.run.checkpoints_folder,
             self.components(),
             keep_last=config.checkpoint.keep_last,
-            keep_best=config.checkpoint.get("keep_best", 1),
+            keep_best=config.checkpoint.keep_best,
             run=run,
-            interface=self.interface,
+            interface=lambda: self.env.interface,
         )
 
     def _make_selection(self, over: int, limits: Mapping[str, float]) -> CheckpointSelection:
-        steps = self._frames_per_batch / self._env.batch_size.numel()
+        steps = self._frames_per_batch / self.env.batch_size.numel()
         return CheckpointSelection(
             {name: part for name, part in self._parts().items() if name not in _FOR_RESUMING},
             limits,
             over=over,
             delay=lambda length: epochs_until_evaluated(over, length, steps),
-            longest=self.episode_length,
+            longest=self.env.max_episode_steps,
         )
 
     def components(self) -> dict[str, Stateful]:
@@ -167,10 +165,10 @@ class Trainer:
         if self._recording is not None:
             self._recording.cut_after(self.progress.epoch - 1)
         self.algorithm.forget_open_episodes()
-        self._env.continue_from(self.progress.steps // self._env.batch_size.numel())
+        self.env.continue_from(self.progress.steps // self.env.batch_size.numel())
         # with the old seed the first episodes of the run would be repeated; workers start later,
         # from the state of this environment
-        self._env.set_seed(int(torch.randint(2**31, ())))
+        self.env.set_seed(int(torch.randint(2**31, ())))
         if isinstance(self._collector, Collector):
             self._collector.reset()
 
@@ -198,8 +196,8 @@ class Trainer:
             self._collector.kill()
         else:
             self._collector.shutdown()
-        if not self._env.is_closed:
-            self._env.close()
+        if not self.env.is_closed:
+            self.env.close()
 
     def _train(self) -> None:
         batches = self.batches()

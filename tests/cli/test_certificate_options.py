@@ -3,8 +3,8 @@
 import pytest
 from run_configs import compose_config
 
-from safe_rl.cli.composing import is_to_keep_limits
 from safe_rl.evaluation.settings import certificate_options
+from safe_rl.runs.identity import is_to_keep_limits
 
 
 @pytest.mark.parametrize(
@@ -32,17 +32,16 @@ def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail
 
 
 @pytest.mark.parametrize(
-    ("overrides", "is_constrained", "is_to"),
+    ("overrides", "is_to"),
     [
-        ([], True, True),
-        ([], False, False),
-        (["transforms=[early_termination]"], False, True),
-        (["transforms=[sensor_noise]"], False, False),
+        (["algo=cpo"], True),
+        (["algo=ppo"], False),
+        (["algo=ppo", "transforms=[early_termination]"], True),
+        (["algo=ppo", "transforms=[sensor_noise]"], False),
     ],
 )
-def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, is_constrained, is_to):
-    config = compose_config("algo=ppo", *overrides)
-    assert is_to_keep_limits(config, is_constrained) == is_to
+def test_a_budget_of_a_transform_is_a_limit_to_keep(overrides, is_to):
+    assert is_to_keep_limits(compose_config(*overrides)) == is_to
 
 
 def test_options_are_replaced_and_wrong_ones_named():

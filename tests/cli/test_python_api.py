@@ -232,7 +232,7 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
 def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch):
     given = []
     monkeypatch.setattr(
-        "safe_rl.training.train.certify_run",
+        "safe_rl.training.finish.certify_run",
         lambda *said, **options: given.append((*said, options)),
     )
     run.certificate_file.unlink()

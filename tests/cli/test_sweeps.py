@@ -38,8 +38,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     summary = Summary(f"{tmp_path}/jobs.jsonl")
     outcomes = {0: 3.5, 1: ValueError("no such cost\nmore"), 2: SystemExit(130)}
 
-    def run_job(config, directory):
-        outcome = outcomes[int(directory.name.removeprefix("seed"))]
+    def run_job(config, settings, run):
+        outcome = outcomes[int(run.directory.name.removeprefix("seed"))]
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
@@ -56,7 +56,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         run_in_sweep(made, config.hydra, directory)
         summary.on_job_end(config, JobReturn())
 
-    monkeypatch.setattr("safe_rl.training.train.run_job", run_job)
+    monkeypatch.setattr("safe_rl.cli.sweeps.run_job", run_job)
     monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")

@@ -187,17 +187,6 @@ def test_a_checkpoint_of_another_seed_is_not_resumed_from(tmp_path):
     assert other.resume().name.endswith("20.torchrl")
 
 
-def test_what_a_killed_run_has_begun_is_cleared(tmp_path):
-    store = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=3)
-    path = store.save(10)
-    store.save_best(10, 0.0)
-    for folder in (store.last, store.best):
-        (folder / ".checkpoint-000000000030.0a.torchrl").write_text("begun")
-    assert store.resume() == path
-    for folder in (store.last, store.best):
-        assert [file.name for file in folder.iterdir()] == [path.name]
-
-
 def test_a_full_disk_leaves_the_checkpoints_that_were_there(tmp_path, monkeypatch):
     counter = Counter(1)
     store = CheckpointStore(tmp_path, {"counter": counter}, keep_last=1)

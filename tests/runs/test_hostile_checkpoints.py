@@ -129,6 +129,6 @@ def test_a_policy_of_nan_is_not_evaluated(trained, tmp_path):
 
     trainer = point_mass_trainer(edited(trained[0], tmp_path, "actor", edit), "frames=480")
     path = Run(tmp_path / "run").newest_checkpoint()
-    config, env = trainer.writer._config, trainer._env
+    config, env = trainer.writer._config, trainer.env
     with pytest.raises(CheckpointError, match="weights that are NaN or infinite"):
         load_policy(config, env, path, torch.device("cpu"))

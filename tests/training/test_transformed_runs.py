@@ -62,7 +62,7 @@ def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_p
     counts += ["frames=640"]
     options = ["algo=sac_lagrangian", "transforms=[action_repeat]", *counts]
     trainer = make_trainer(tmp_path, *options, minibatch_size=None)
-    starts = trainer._env.get_state()["step_count"][:, 0].tolist()
+    starts = trainer.env.get_state()["step_count"][:, 0].tolist()
     assert starts == [0, 4, 8, 12]  # of 20 steps: 0, 5, 10, 15 rounded down to decisions
     batch = next(trainer.batches())
     assert batch.shape == (4, 10)

@@ -7,10 +7,11 @@ import pytest
 import torch
 from run_configs import compose_config, without_times
 
+from safe_rl.cli.sweeps import run_job
 from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.run import Run
-from safe_rl.training import train as module
-from safe_rl.training.train import run_job, train
+from safe_rl.training import finish
+from safe_rl.training.train import is_expected, train
 from safe_rl.training.trainer import Trainer
 
 SMALL = (
@@ -62,12 +63,12 @@ def test_a_job_that_dies_before_its_certificate_is_certified_by_the_next_sweep(
 
     monkeypatch.setattr(Trainer, "run", die)
     with pytest.raises(Killed):
-        run_job(small(), tmp_path / "run")
+        run_job(small(), None, Run(tmp_path / "run"))
     monkeypatch.undo()
-    assert run_job(small(), tmp_path / "run") > -1e9
+    assert run_job(small(), None, Run(tmp_path / "run")) > -1e9
     assert Run(tmp_path / "run").certificate["candidates"][-1] == 80
-    monkeypatch.setattr(module, "certify", lambda *_, **__: pytest.fail("certified twice"))
-    run_job(small(), tmp_path / "run")
+    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("certified twice"))
+    run_job(small(), None, Run(tmp_path / "run"))
 
 
 def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, monkeypatch):
@@ -77,14 +78,14 @@ def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, m
     config = [*words, "logger=none", "num_threads=1", "certificate.ranking=2"]
     train(compose_config(*config, "certificate.episodes=0"), tmp_path / "run")
     tested = []
-    monkeypatch.setattr(module, "certify", lambda directory, *_, **__: tested.append(directory))
+    monkeypatch.setattr(finish, "certify", lambda directory, *_, **__: tested.append(directory))
     train(compose_config(*config, "certificate.episodes=5"), tmp_path / "run", continues=True)
     assert tested == [tmp_path / "run"]
 
 
 def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
     run = train(small("certificate.episodes=0"), tmp_path / "run")
-    monkeypatch.setattr(module, "certify", lambda *_, **__: pytest.fail("tested without the lock"))
+    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("tested without the lock"))
     ready, proceed = os.pipe(), os.pipe()
     child = os.fork()
     if not child:
@@ -95,7 +96,7 @@ def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
     os.read(ready[0], 1)
     try:
         with pytest.raises(RunInUseError):
-            module.certify_run(run.directory)
+            finish.certify_run(run.directory)
     finally:
         os.write(proceed[1], b"x")
         os.waitpid(child, 0)
@@ -137,7 +138,7 @@ def test_an_error_of_training_that_no_setting_explains_keeps_its_traceback(tmp_p
 
     with pytest.raises(ValueError, match="in a callback") as caught:
         train(small(), tmp_path / "run", callbacks=[fail])
-    assert not module.is_expected(caught.value)
+    assert not is_expected(caught.value)
     with pytest.raises(FileExistsError) as caught:
         train(small(), tmp_path / "run")
-    assert module.is_expected(caught.value)
+    assert is_expected(caught.value)
