@@ -18,16 +18,16 @@ from pathlib import Path
 import safe_rl  # isort: skip  # noqa: F401, before torch, for its settings of threads
 import torch
 
-from safe_rl.envs import SafetyGymEnv
-from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs import make_env
 
-IDS = ("PointGoal1", "CarGoal1", "DoggoGoal2", "PointButton2")
+IDS = ("PointGoal1", "CarGoal1", "DoggoGoal2", "PointButton2", "SafeAntVelocity")
 TRAIN = Path(__file__).parents[1] / "train.py"
 
 
-def rate(config, num_envs, steps, device):
-    """Environment steps/s within episodes."""
-    env = SafetyGymEnv(config, num_envs, device, seed=0)
+def rate(name, num_envs, steps, device, **keys):
+    """Environment steps/s within episodes; robots that fall stay on the floor."""
+    env = make_env(name, num_envs=num_envs, device=device, seed=0, **keys)
+    steps = min(steps, env.config.num_steps - 1)
     state = env.reset()
     actions = env.action_spec.rand((steps + 1,))
     env._step(state.set("action", actions[0]))
@@ -63,12 +63,9 @@ def main():
     print("| environment | worlds | warp, steps/s | CPU, steps/s | training, steps/s |")
     print("|---|---|---|---|---|")
     for name in arguments.ids:
-        config = resolve(name)
-        steps = min(arguments.steps, config.num_steps - 1)
-        on_cpu = rate(config, arguments.cpu_worlds, steps, torch.device("cpu"))
-        warp = config.replace(physics="warp")
+        on_cpu = rate(name, arguments.cpu_worlds, arguments.steps, torch.device("cpu"))
         for worlds in arguments.worlds:
-            on_warp = rate(warp, worlds, steps, arguments.device)
+            on_warp = rate(name, worlds, arguments.steps, arguments.device, physics="warp")
             trained = "—"
             if arguments.training:
                 trained = f"{training_rate(name, worlds, arguments.device):,.0f}"

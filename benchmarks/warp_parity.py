@@ -16,16 +16,24 @@ import torch
 
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityConfig, VelocityEnv, resolve_velocity
 
 IDS = ("PointGoal1", "PointButton2", "CarGoal1", "CarPush2", "DoggoGoal1", "DoggoButton1")
 NEAR, FAR = 1e-5, 1e-3
 NUDGE, NUDGES = 1e-7, 8  # m or rad; how many
 
 
+def make(config, *arguments, **keys):
+    """An environment of either family."""
+    family = VelocityEnv if isinstance(config, VelocityConfig) else SafetyGymEnv
+    return family(config, *arguments, **keys)
+
+
 def one_step(config, num_envs, steps, device):
     """Differences after one step, and MuJoCo's own after small changes, [steps x worlds]."""
-    warp = SafetyGymEnv(config.replace(physics="warp"), num_envs, device, seed=0)
-    cpu = SafetyGymEnv(config, num_envs, seed=0, sleep=False)
+    warp = make(config.replace(physics="warp"), num_envs, device, seed=0)
+    sleepless = {} if isinstance(config, VelocityConfig) else {"sleep": False}
+    cpu = make(config, num_envs, seed=0, **sleepless)
     start, on_device = cpu.reset(), warp.reset()
     torch.manual_seed(0)
 
@@ -54,13 +62,13 @@ def one_step(config, num_envs, steps, device):
 
 def episodes(config, num_envs, num_steps, device, seed):
     """Return, costs and goals of one episode of random actions in every world, name -> [N]."""
-    env = SafetyGymEnv(config.replace(num_steps=num_steps), num_envs, device, seed=seed)
+    env = make(config.replace(num_steps=num_steps), num_envs, device, seed=seed)
     torch.manual_seed(seed)
     state, sums = env.reset(), {}
     for _ in range(num_steps):
         state.set("action", env.action_spec.rand())
         following = env._step(state)
-        for key in ("reward", *env.cost_keys, "goal_met"):
+        for key in ("reward", *env.cost_keys, *env.events):
             sums[key] = sums.get(key, 0.0) + following[key].squeeze(-1).double().cpu()
     return sums
 
@@ -97,7 +105,7 @@ def main():
     print("| z of return, costs, goals |")
     print("|---|---|---|---|---|---|---|---|")
     for name in arguments.ids:
-        config = resolve(name)
+        config = (resolve_velocity if name in VELOCITY_SUITE else resolve)(name)
         apart, nudged = one_step(config, arguments.step_worlds, arguments.steps, arguments.device)
         z = z_scores(config, arguments.episodes, arguments.episode_steps, arguments.device)
         numbers = (apart.median(), apart.quantile(0.99), apart.max())

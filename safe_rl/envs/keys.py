@@ -25,12 +25,12 @@ class ConfigError(ValueError):
 
 
 def on_cpu_only(key: str) -> str:
-    """Return a hint for MuJoCo Warp's keys, which only Safety Gym has; else an empty text."""
+    """Return a hint for MuJoCo Warp's keys, which other libraries lack; else an empty text."""
     if key not in ("physics", "physics_buffers"):
         return ""
     return (
-        f" Only Safety Gym's environments have '{key}': the physics of all others, such as the "
-        "velocity family, runs on the CPU only. Remove it, and preset=gpu, which sets 'physics'."
+        f" Only Safety Gym's environments and the velocity family have '{key}': the physics of all "
+        "others runs on the CPU only. Remove it, and preset=gpu, which sets 'physics'."
     )
 
 
@@ -40,6 +40,7 @@ Positive = Annotated[float, Interval(gt=0, le=1e9)]
 NotNegative = Annotated[float, Interval(ge=0, le=1e9)]
 Count = Annotated[int, Interval(ge=1, le=10**15)]
 Seed = Annotated[int, Interval(ge=0, lt=2**63)]
+Backend = Literal["cpu", "warp"]
 Threads = Annotated[int, Interval(ge=0, le=10**6)]
 _RANGE = rule(lambda row: row[0] <= row[1], "a factor, or the lowest and the highest one")
 Factor = Positive | Annotated[tuple[Positive, Positive], _RANGE]

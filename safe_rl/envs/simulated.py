@@ -16,8 +16,9 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, checked
-from safe_rl.envs.physics import BatchPhysics, Physics
+from safe_rl.envs.physics import OUTPUTS, BatchPhysics, Physics
 from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
+from safe_rl.envs.physics.warp_backend import make_warp_physics
 
 
 class SimulatedEnv(ConstrainedEnv):
@@ -61,6 +62,13 @@ class SimulatedEnv(ConstrainedEnv):
         checked("num_threads", Threads, num_threads)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self._physics_settings: tuple[Any, ...] = (num_threads,)
+
+    def _make_physics(
+        self, model: mujoco.MjModel, num_threads: int, outputs: Sequence[str] = OUTPUTS
+    ) -> Physics:
+        if self.config.physics == "cpu":
+            return BatchPhysics(model, self.batch_size[0], num_threads, outputs)
+        return make_warp_physics(self, model, outputs)
 
     def _draw_dynamics(self, model: mujoco.MjModel, bodies: slice) -> None:
         """Prepare the drawing of factors; `bodies` are the ids of the robot's bodies."""
@@ -188,6 +196,10 @@ class SimulatedEnv(ConstrainedEnv):
     @abstractmethod
     def _begin(self, mask: Tensor) -> None:
         """Begin the episodes `_episode` in the worlds of a mask, bool [N]."""
+
+    @abstractmethod
+    def _advance(self, action: Tensor) -> Tensor:
+        """Run the substeps of one step; return the worlds whose physics failed, bool [N]."""
 
     @abstractmethod
     def _observe(self) -> Tensor | TensorDict:

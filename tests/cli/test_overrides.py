@@ -79,13 +79,16 @@ def test_what_only_other_algorithms_have_is_refused(algo, argument, words):
 
 
 @pytest.mark.parametrize(
-    ("preset", "algo", "key"),
-    [("privileged", "sac_lagrangian", "observe_privileged"), ("gpu", "cpo", "physics")],
+    ("preset", "algo", "key", "env"),
+    [
+        ("privileged", "sac_lagrangian", "observe_privileged", "SafeHopperVelocity"),
+        ("gpu", "cpo", "physics", "gymnasium"),
+    ],
 )
-def test_what_a_preset_sets_and_only_other_environments_have_is_refused(preset, algo, key):
-    message = rf"^preset={preset} sets 'env\.{key}', .*SafeHopperVelocity.* env=PointGoal1\.$"
+def test_what_a_preset_sets_and_only_other_environments_have_is_refused(preset, algo, key, env):
+    message = rf"^preset={preset} sets 'env\.{key}', .*{env}.* env=PointGoal1\.$"
     with pytest.raises(ValueError, match=message):
-        composed("env=SafeHopperVelocity", f"algo={algo}", f"preset={preset}")
+        composed(f"env={env}", f"algo={algo}", f"preset={preset}")
 
 
 def test_an_algorithm_without_limits_takes_none_from_a_preset():

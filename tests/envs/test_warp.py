@@ -8,6 +8,7 @@ from commands import run_train
 from looking import CountLooks
 from omegaconf import OmegaConf
 from run_configs import compose_config
+from torchrl.envs.utils import check_env_specs
 
 pytest.importorskip("mujoco_warp")
 
@@ -17,6 +18,7 @@ from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.safety_gym.suite import resolve
+from safe_rl.envs.velocity import VELOCITY_SUITE
 from safe_rl.runs.identity import experiment_of
 from safe_rl.training.building import build_trainer, seed_everything
 
@@ -76,6 +78,57 @@ def test_one_step_is_that_of_mujoco(name, most):
     assert apart.median() < 1e-5
     # in a few of the 80 rows a contact switches, and positions differ by more
     assert (apart > most).sum() <= 2
+
+
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+def test_one_step_of_a_robot_is_that_of_mujoco(name):
+    """Random actions from a start until most robots have fallen, each step from equal states."""
+    cpu, warp = (
+        make_env(name, num_envs=16, seed=0, velocity_threshold=0.1, physics=physics)
+        for physics in ("cpu", "warp")
+    )
+    torch.testing.assert_close(cpu.reset(), warp.reset(), atol=1e-5, rtol=1e-5)
+    apart, differ, steps = [], 0, []
+    for (step, state), (other, following) in steps_from_equal_states(cpu, warp, 60):
+        far = (state["qpos"] - following["qpos"]).abs().amax(-1) > 1e-5
+        for key in ("observation", "reward"):
+            far |= ((step[key] - other[key]).abs() > 1e-3 * (1 + step[key].abs())).any(-1)
+        apart.append(far)
+        for key in ("cost", "cost_velocity", "terminated", "truncated"):
+            differ += int((step[key] != other[key]).sum())
+        steps.append(step)
+    # Where a contact begins or ends, rounding decides; a speed may round across the threshold.
+    assert torch.stack(apart).double().mean() < 0.02
+    assert differ <= 4
+    seen = torch.stack(steps)
+    assert seen["cost"].unique().tolist() == [0.0, 1.0]
+    assert seen["terminated"].any() == ("healthy_z_range" in cpu.config.to_dict())
+    if "cfrc_ext" in cpu.observation_layout:
+        assert seen["observation"][..., cpu.observation_layout["cfrc_ext"]].any()
+
+
+@pytest.mark.parametrize("name", ["SafeHalfCheetahVelocity", "SafeHumanoidVelocity"])
+def test_robots_on_warp_follow_the_rules_of_environments(name):
+    env = make_env(name, num_envs=4, seed=0, physics="warp", num_steps=20)
+    check_env_specs(env)
+    env.set_seed(1)
+    # episodes of any number of steps, and each row begins its own
+    rollout = env.rollout(50, break_when_any_done=False)
+    assert rollout["next", "done"].any()
+    copied = pickle.loads(pickle.dumps(env))
+    action = {"action": env.action_spec.rand()}
+    first, second = (each._step(each.fake_tensordict().update(action)) for each in (env, copied))
+    torch.testing.assert_close(first, second, atol=1e-4, rtol=1e-4)
+
+
+def test_the_observation_of_a_robot_whose_physics_failed_has_numbers():
+    env = make_env("SafeAntVelocity", num_envs=2, seed=0, physics="warp")
+    state = env.reset().set("action", env.action_spec.zero())
+    env._physics.qvel[1] = torch.nan
+    step = env._step(state)
+    assert step["terminated"].tolist() == [[False], [True]]
+    assert step["observation"].isfinite().all()
+    assert step["reward"][1] == 0.0
 
 
 def test_rays_see_what_mujoco_sees():
@@ -172,11 +225,16 @@ def test_what_is_wrong_on_the_device_is_said_by_a_later_call(two):
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize(
-    ("algo", "choice"), [("ppo_lagrangian", "preset=gpu"), ("sac_lagrangian", "env.physics=warp")]
+    ("env", "algo", "choice"),
+    [
+        ("PointGoal1", "ppo_lagrangian", "preset=gpu"),
+        ("PointGoal1", "sac_lagrangian", "env.physics=warp"),
+        ("SafeAntVelocity", "ppo_lagrangian", "preset=gpu"),
+    ],
 )
-def test_training_and_a_certificate_on_warp(algo, choice, device, tmp_path):
+def test_training_and_a_certificate_on_warp(env, algo, choice, device, tmp_path):
     run_train(
-        *("env=PointGoal1", f"algo={algo}", choice, f"device={device}", "num_envs=4"),
+        *(f"env={env}", f"algo={algo}", choice, f"device={device}", "num_envs=4"),
         *("env.num_steps=10", "frames=64", "frames_per_batch=32", "certificate.ranking=2"),
         *("certificate.episodes=4", "logger=none", "num_threads=1", f"hydra.run.dir={tmp_path}"),
     )

@@ -48,6 +48,7 @@ class Physics(ABC):
             `history` [N, nhistory]; without entries that the model does not need.
         xpos, xmat, sensordata, subtree_com: The outputs, [N, nbody, 3] (m), [N, nbody, 3, 3],
             [N, nsensordata] and [N, nbody, 3] (m).
+        outputs: All fields of `MjData` that are read, by name.
     """
 
     device: torch.device
@@ -66,6 +67,7 @@ class Physics(ABC):
     xmat: Tensor
     sensordata: Tensor
     subtree_com: Tensor
+    outputs: Mapping[str, Tensor]
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:
@@ -81,6 +83,7 @@ class Physics(ABC):
         num_substeps: int,
         mocap_path: Tensor | None = None,
         counts: Tensor | None = None,
+        refresh: bool = True,
     ) -> Tensor:
         """Advance by substeps under constant `ctrl`, then compute the outputs.
 
@@ -89,6 +92,9 @@ class Physics(ABC):
             mocap_path: Mocap positions before each substep [N, S, nmocap, 3]; None if they do not
                 change.
             counts: A number of substeps for each simulation, at most S, int64 [N]; None means S.
+            refresh: Whether the outputs are those of the state that is reached. If not, they stay
+                as `mj_step` leaves them: those of the last state that the last substep evaluated,
+                with the Runge-Kutta integrator its fourth stage.
 
         Returns:
             bool [N]: simulations that failed (non-finite or huge state); their state is finite
@@ -132,6 +138,11 @@ class Physics(ABC):
             raise error()
 
 
+def put(target: Tensor, mask: Tensor, values: Tensor) -> None:
+    """Write values [N, ...] to a tensor [N, ...] in the rows of a mask [N]."""
+    target.copy_(torch.where(mask.view(-1, *[1] * (target.ndim - 1)), values, target))
+
+
 _PATH_INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_MOCAP_POS)
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
@@ -155,9 +166,6 @@ class BatchPhysics(Physics):
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
         outputs: Names of the fields of `MjData` that are read; every call copies them.
-
-    Attributes:
-        outputs: All of these fields, by name.
     """
 
     device = torch.device("cpu")
@@ -231,11 +239,7 @@ class BatchPhysics(Physics):
         counts: Tensor | None = None,
         refresh: bool = True,
     ) -> Tensor:
-        """Advance by substeps and compute the outputs, see `Physics`.
-
-        Without `refresh`, the outputs stay as `mj_step` leaves them. They belong to the last state
-        that the last substep evaluated: with the Runge-Kutta integrator, to its fourth stage.
-        """
+        """Advance by substeps and compute the outputs, see `Physics`."""
         self._check_process()
         # Sensors are not read between substeps; without them the result is the same to the bit.
         self._disableflags[:] = self._with_sensors | _NO_SENSORS

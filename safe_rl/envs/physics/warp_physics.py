@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -50,6 +50,7 @@ class WarpPhysics(Physics):
         device: Device of the simulations.
         contacts: Contacts per simulation that the buffer can hold; all simulations share it.
         constraints: Rows of constraints that the buffer of each simulation can hold.
+        outputs: Names of the fields of `MjData` that are read.
 
     Raises:
         NotImplementedError: If the model uses a feature that MuJoCo Warp lacks.
@@ -65,6 +66,7 @@ class WarpPhysics(Physics):
         device: torch.device | str,
         contacts: int,
         constraints: int,
+        outputs: Sequence[str] = OUTPUTS,
     ) -> None:
         self.device = torch.device(device)
         self.waits = self.device.type == "cuda"
@@ -90,6 +92,7 @@ class WarpPhysics(Physics):
                 model, num_envs, nconmax=contacts, njmax=constraints, nvmax=None
             )
         self._bind(model)
+        self.outputs = {name: wp.to_torch(getattr(self._data, name)) for name in outputs}
         self._warm_up()
 
     def _bind(self, model: mujoco.MjModel) -> None:
@@ -141,6 +144,7 @@ class WarpPhysics(Physics):
         num_substeps: int,
         mocap_path: Tensor | None = None,
         counts: Tensor | None = None,
+        refresh: bool = True,
     ) -> Tensor:
         """Advance by substeps and compute the outputs, see `Physics`."""
         path = None
@@ -153,11 +157,14 @@ class WarpPhysics(Physics):
             if num_substeps not in self._paths:
                 self._paths[num_substeps] = torch.empty_like(columns, dtype=self.dtype)
             path = self._paths[num_substeps].copy_(columns)
-        key = ("step", num_substeps, path is None, counts is None)
-        self._run(key, self._step, num_substeps, path, counts is not None)
+        key = ("step", num_substeps, path is None, counts is None, refresh)
+        self._run(key, self._step, num_substeps, path, counts is not None, refresh)
         self._check_rooms()
         failed = self._failed.clone()
         self._failed.zero_()
+        if not refresh:  # those of failed simulations may not be numbers
+            for output in self.outputs.values():
+                output.masked_fill_(failed.view(-1, *[1] * (output.ndim - 1)), 0.0)
         return failed
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
@@ -223,15 +230,17 @@ class WarpPhysics(Physics):
         with self._launching():
             wp.capture_launch(self._graphs[key])
 
-    def _step(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
+    def _step(self, num_substeps: int, path: Tensor | None, differ: bool, refresh: bool) -> None:
         self._substeps(num_substeps, path, differ)
+        if not refresh and "cfrc_ext" in self.outputs:
+            mjw.rne_postconstraint(self._model, self._data)
         failed = [wp.from_torch(self._failed)]
         for name in ("qpos", "qvel", "qacc_warmstart"):
             if name in self._rows:
                 row = self._rows[name]
                 wp.launch(find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
         self._reset(self._failed)
-        self._forward()
+        self._forward() if refresh else self._note_overflow()
 
     def _substeps(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
         counts = wp.from_torch(self._counts)
@@ -249,8 +258,11 @@ class WarpPhysics(Physics):
                     wp.launch(restore_rows, live.shape, [counts, substep, saved], [live])
 
     def _forward(self) -> None:
+        mjw.forward(self._model, self._data)
+        self._note_overflow()
+
+    def _note_overflow(self) -> None:
         data = self._data
-        mjw.forward(self._model, data)
         lost = [data.overflow, _LOST_CONTACTS, _LOST_ROWS]
         wp.launch(
             note_overflow,

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 from annotated_types import Interval, MinLen
 
 from safe_rl.checks import Share, Text, rule
-from safe_rl.envs.keys import Count, Factor, FactorOrZero, NotNegative, Number, Positive
+from safe_rl.envs.keys import Backend, Count, Factor, FactorOrZero, NotNegative, Number, Positive
 
 LARGEST_SEED = 2**62  # of layouts; layout seeds are hashed as 64-bit integers
 
@@ -27,7 +27,6 @@ Seed = Annotated[int, Interval(ge=0, le=LARGEST_SEED)]
 Seeds = Annotated[int, Interval(ge=1, le=LARGEST_SEED)]
 _Side = Annotated[int, Interval(ge=1, le=4096)]
 Pixels = tuple[_Side, _Side]
-Backend = Literal["cpu", "warp"]
 Lidar = Literal["pseudo", "natural"]
 
 Rectangle = Annotated[

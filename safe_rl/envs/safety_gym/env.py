@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
-import mujoco
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import BatchPhysics, Physics
+from safe_rl.envs.physics import put
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
@@ -29,7 +28,6 @@ from safe_rl.envs.safety_gym.episodes import (
     pick_layouts,
     place_mocaps,
     point_goal_at_button,
-    put,
     refresh,
     start_episodes,
     stored_tensors,
@@ -39,7 +37,6 @@ from safe_rl.envs.safety_gym.observations import Privileged, make_observer, obse
 from safe_rl.envs.safety_gym.renderer import WorldRenderer, vision_block
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goal_is_button
-from safe_rl.envs.safety_gym.warp_backend import make_warp_physics
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
 
 _LIDAR = ("lidar_type", "lidar_max_dist", "lidar_exp_gain", "lidar_alias")
@@ -129,11 +126,6 @@ class SafetyGymEnv(SimulatedEnv):
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
         self._draw_dynamics(scene.model, slice(1, scene.free_bodies.start))
         self._announce(scene.model, observed, highest, seed)
-
-    def _make_physics(self, model: mujoco.MjModel, num_threads: int) -> Physics:
-        if self.config.physics == "cpu":
-            return BatchPhysics(model, self.batch_size[0], num_threads)
-        return make_warp_physics(self.config, model, self.batch_size[0], self.device, SafetyGymEnv)
 
     @property
     def object_names(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import Physics
+from safe_rl.envs.physics import Physics, put
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.layouts import (
     LayoutError,
@@ -111,11 +111,6 @@ def refresh(world: World) -> None:
     scene = world.scene
     if scene.num_free:
         world.positions[:, : scene.num_free] = world.physics.xpos[:, scene.free_bodies]
-
-
-def put(target: Tensor, mask: Tensor, values: Tensor) -> None:
-    """Write values [N, ...] to a tensor [N, ...] in the rows of a mask [N]."""
-    target.copy_(torch.where(mask.view(-1, *[1] * (target.ndim - 1)), values, target))
 
 
 def yaw_quaternion(yaw: Tensor) -> Tensor:

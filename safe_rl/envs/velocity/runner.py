@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.physics import BatchPhysics
+from safe_rl.envs.physics import Physics, put
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.pictures import Camera, Marker, Pictures
 from safe_rl.envs.velocity.velocity_config import PARTS, RUNNERS, Interval, VelocityConfig
@@ -44,19 +44,19 @@ class Place(NamedTuple):
     """
 
     outputs: tuple[str, ...]
-    reading: Callable[[mujoco.MjModel, BatchPhysics], Callable[[], Tensor]]
+    reading: Callable[[mujoco.MjModel, Physics], Callable[[], Tensor]]
 
 
-def _x(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+def _x(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
     return lambda: physics.qpos[:, :1].clone()
 
 
-def _torso(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
+def _torso(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
     return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
 
 
-def _centre_of_mass(model: mujoco.MjModel, physics: BatchPhysics) -> Callable[[], Tensor]:
-    shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
+def _centre_of_mass(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
+    shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None].to(physics.qpos)
     return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
 
 
@@ -147,7 +147,8 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
     """Compile a robot's file.
 
     If contact forces are needed, an added sensor makes MuJoCo compute them. It changes nothing else
-    but `sensordata`.
+    but `sensordata`. MuJoCo Warp lacks the solver of Humanoid's file (PGS); there, Newton's method
+    minimises the same function.
     """
     spec = mujoco.MjSpec.from_file(str(ASSETS / RUNNERS[config.robot].mjcf))
     if needs_forces(config):
@@ -162,6 +163,8 @@ def load_model(config: VelocityConfig) -> mujoco.MjModel:
         # The warnings are about Gymnasium's files, which users cannot change.
         warnings.filterwarnings("ignore", message="compiler attribute")
         model = spec.compile()
+    if config.physics == "warp":
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     scale_dynamics(model, {key: getattr(config, key) for key in SCALES}, slice(1, model.nbody))
     return model
 
@@ -184,11 +187,11 @@ def needed_outputs(config: VelocityConfig) -> list[str]:
 
 
 class Part(NamedTuple):
-    """A named component: its number of columns, and how to read it, float64 [N, size]."""
+    """A named component: its number of columns, and how to read it, [N, size]."""
 
     name: str
     size: int
-    read: Callable[[BatchPhysics], Tensor]
+    read: Callable[[Physics], Tensor]
 
 
 class Observer:
@@ -208,20 +211,21 @@ class Observer:
         self.columns = add_columns({}, {part.name: part.size for part in self._parts})
         self.size = sum(part.size for part in self._parts)
 
-    def write(self, physics: BatchPhysics, observation: Tensor) -> None:
+    def write(self, physics: Physics, observation: Tensor) -> None:
         """Write the observation of all robots after a step into [N, size]."""
         for part in self._parts:
             observation[:, self.columns[part.name]] = part.read(physics)
 
-    def write_start(self, physics: BatchPhysics, observation: Tensor, rows: Tensor) -> None:
-        """Write the observation of rows (int64 [R]) before the first step of an episode.
+    def write_start(self, physics: Physics, observation: Tensor, mask: Tensor) -> None:
+        """Write the observation before the first step of an episode in the rows of a mask [N].
 
         Contact forces are 0, because Gymnasium computes them only in a step.
         """
-        for part in self._parts:
-            columns = self.columns[part.name]
-            start = 0.0 if part.name == FORCES else part.read(physics)[rows].to(observation.dtype)
-            observation[rows, columns] = start
+        start = torch.empty_like(observation)
+        self.write(physics, start)
+        if FORCES in self.columns:
+            start[:, self.columns[FORCES]] = 0.0
+        put(observation, mask, start)
 
 
 def _joints(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
@@ -250,7 +254,7 @@ def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
 class RobotRenderer(Pictures):
     """Draws the robots of one environment in their present state."""
 
-    def __init__(self, config: VelocityConfig, physics: BatchPhysics) -> None:
+    def __init__(self, config: VelocityConfig, physics: Physics) -> None:
         super().__init__()
         self._config, self._physics = config, physics
 
@@ -260,7 +264,7 @@ class RobotRenderer(Pictures):
         """Draw robots `rows`, with a sphere where `has_cost` [N]: uint8 [R, height, width, 3]."""
         frames = np.empty((len(rows), height, width, 3), dtype=np.uint8)
         for frame, row in zip(frames, rows, strict=True):
-            self.data.qpos[:] = self._physics.qpos[row].numpy()
+            self.data.qpos[:] = self._physics.qpos[row].cpu().numpy()
             self.place()
             size, place = (COST_RADIUS,) * 3, self.data.xpos[TORSO]
             sphere = Marker(mujoco.mjtGeom.mjGEOM_SPHERE, size, place, COST_RGBA)

@@ -17,14 +17,15 @@ from pydantic import AllowInfNan
 
 from safe_rl.checks import rule
 from safe_rl.envs.keys import (
+    Backend,
     ConfigError,
     Count,
     Factor,
     FactorOrZero,
     NotNegative,
     Number,
+    Positive,
     checked,
-    on_cpu_only,
 )
 from safe_rl.naming import did_you_mean
 
@@ -108,9 +109,9 @@ _OF_ROBOT: Any = None  # replaced by the default of the robot, which every robot
 class VelocityConfig:
     """Everything that defines one environment; keys that its robot does not have are None.
 
-    Except `robot`, `velocity_threshold`, `num_steps` and the scales of the dynamics, the keys are
-    those of Gymnasium's environments of version 5 (Towers et al. 2024). Use `from_dict`, which adds
-    the robot's defaults.
+    Except `robot`, `velocity_threshold`, `num_steps`, `physics`, `physics_buffers` and the scales
+    of the dynamics, the keys are those of Gymnasium's environments of version 5 (Towers et al.
+    2024). Use `from_dict`, which adds the robot's defaults.
 
     Raises:
         ConfigError: If a value has the wrong type or is out of range.
@@ -125,6 +126,8 @@ class VelocityConfig:
     velocity_threshold: Annotated[NotNegative, "speed above which a step costs 1 [m/s]"] = _OF_ROBOT
     num_steps: Annotated[Count, "steps after which an episode is truncated"] = 1000
     frame_skip: Annotated[Count, "substeps per step"] = _OF_ROBOT
+    physics: Annotated[Backend, "MuJoCo on the CPU, or MuJoCo Warp on the device"] = "cpu"
+    physics_buffers: Annotated[Positive, "room for contacts on Warp, per contact in a trial"] = 2.0
     # Factors on the values in Gymnasium's file; two numbers: the range of one that is drawn for
     # every episode. Friction cannot be 0 in MuJoCo.
     mass_scale: Annotated[Factor, "factor on masses and inertias"] = 1.0
@@ -177,7 +180,7 @@ class VelocityConfig:
         """
         for name in keys:
             if name not in ANNOTATIONS:
-                hint = on_cpu_only(name) or did_you_mean(str(name), ANNOTATIONS)
+                hint = did_you_mean(str(name), ANNOTATIONS)
                 raise ConfigError(f"A velocity environment has no key '{name}'.{hint}")
         return cls(**keys)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import BatchPhysics
+from safe_rl.envs.physics import BatchPhysics, put
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
 from safe_rl.envs.velocity.runner import (
@@ -54,7 +54,8 @@ class VelocityEnv(SimulatedEnv):
         env: Name ("SafeHopperVelocity"), mapping with `robot` and configuration keys, or
             `VelocityConfig`.
         num_envs: Number of robots, N.
-        device: Device of the TensorDicts; the physics runs on the CPU.
+        device: Device of the TensorDicts. The physics runs on the CPU, or on this device if the key
+            `physics` is "warp".
         seed: Integer that determines every draw; None draws one from torch's generator. The
             episodes of row k do not depend on N or the number of threads.
         num_threads: Threads that step the physics; 0 for one per core.
@@ -70,7 +71,6 @@ class VelocityEnv(SimulatedEnv):
     """
 
     first_camera: ClassVar = "track"
-    _physics: BatchPhysics
 
     def __init__(
         self,
@@ -85,53 +85,54 @@ class VelocityEnv(SimulatedEnv):
         self.cost_keys = ["cost", "cost_velocity"]
         self._model = load_model(self.config)
         outputs = needed_outputs(self.config)
-        self._physics = BatchPhysics(self._model, num_envs, num_threads, outputs)
+        self._physics = physics = self._make_physics(self._model, num_threads, outputs)
         self.seconds_per_step = self._physics.timestep * self.config.frame_skip
         self._observer = Observer(self.config, self._model)
         place = PLACES[RUNNERS[self.config.robot].place]
         self._place = place.reading(self._model, self._physics)
         self._last_place = self._place()
-        self._observation = torch.zeros(num_envs, self._observer.size)
-        self._step_count = torch.zeros(num_envs, dtype=torch.int64)
-        self._starts = Starts(self.config, self._model, num_envs)
+        self._observation = torch.zeros(num_envs, self._observer.size, device=physics.device)
+        self._step_count = torch.zeros(num_envs, dtype=torch.int64, device=physics.device)
+        self._starts = Starts(self.config, self._model)
         observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
         self._draw_dynamics(self._model, slice(1, self._model.nbody))
         self._announce(self._model, observed, highest=1.0, seed=seed)
 
     def _begin(self, mask: Tensor) -> None:
-        physics, rows = self._physics, mask.nonzero()[:, 0]
+        physics = self._physics
         physics.reset(mask)
-        start = self._starts.take(self._row_seed, self._episode, rows)
-        physics.qpos[rows], physics.qvel[rows] = start
+        qpos, qvel = self._starts.take(self._row_seed, self._episode, mask)
+        put(physics.qpos, mask, qpos)
+        put(physics.qvel, mask, qvel)
         physics.forward(mask)
-        self._start(rows)
-        self._step_count[rows] = 0
+        self._start(mask)
+        self._step_count.masked_fill_(mask, 0)
 
-    def _start(self, rows: Tensor) -> None:
-        """Write place and observation of rows, int64 [R], whose state was set, not stepped to."""
-        self._last_place[rows] = self._place()[rows]
-        self._observer.write_start(self._physics, self._observation, rows)
+    def _start(self, mask: Tensor) -> None:
+        """Write place and observation in the rows of a mask, whose state was not stepped to."""
+        put(self._last_place, mask, self._place())
+        self._observer.write_start(self._physics, self._observation, mask)
 
     def _observe(self) -> Tensor:
         return self._observation.clone().to(self.device)
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self._checked_action(tensordict).to(torch.float64)
-        require_episodes(self._begun)
+        action = self._checked_action(tensordict).to(self._physics.dtype)
+        if not self._all_begun:
+            require_episodes(self._begun)
         reward, terminated = self._move(action.clamp(*self._control_range))
         self._observer.write(self._physics, self._observation)
         self._step_count += 1
         truncated = (self._step_count >= self.config.num_steps) & ~terminated
-        cost = self._has_cost.to(torch.float64)
+        cost = self._has_cost.to(reward.dtype)
         flags = torch.stack([terminated | truncated, terminated, truncated])
         return self._output(flags, torch.stack([reward, cost, cost]))
 
     def _move(self, control: Tensor) -> tuple[Tensor, Tensor]:
-        """Take one step; returns reward and termination, float64 and bool [N]."""
+        """Take one step; returns reward and termination, float and bool [N]."""
         config, physics = self.config, self._physics
-        physics.ctrl.copy_(control)
-        failed = self._advance()
+        failed = self._advance(control)
         place = self._place()
         velocity = (place - self._last_place) / self.seconds_per_step
         self._last_place.copy_(place)
@@ -141,17 +142,19 @@ class VelocityEnv(SimulatedEnv):
         terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
         return reward.masked_fill_(failed, 0.0), terminated
 
-    def _advance(self) -> Tensor:
+    def _advance(self, action: Tensor) -> Tensor:
         """Run the substeps of one step; returns the robots whose physics failed [N]."""
-        if FORCES not in self._physics.outputs:
-            return self._physics.step(self.config.frame_skip, refresh=False)
-        failed = self._physics.step(self.config.frame_skip - 1, refresh=False)
-        return failed | runge_kutta_substep(self._physics)
+        physics, num_substeps = self._physics, self.config.frame_skip
+        physics.ctrl.copy_(action)
+        if FORCES in physics.outputs and isinstance(physics, BatchPhysics):
+            failed = physics.step(num_substeps - 1, refresh=False)
+            return failed | runge_kutta_substep(physics)
+        return physics.step(num_substeps, refresh=False)
 
     def _healthy(self) -> Tensor:
         """Return which robots are healthy, bool [N]."""
         if self.config.robot not in HEALTH:
-            return torch.ones(self.batch_size, dtype=torch.bool)
+            return torch.ones_like(self._begun)
         return HEALTH[self.config.robot](self.config, self._physics.qpos, self._physics.qvel)
 
     @cached_property
@@ -166,13 +169,13 @@ class VelocityEnv(SimulatedEnv):
 
     def _write_state(self, state: TensorDictBase) -> None:
         check_state(self.get_state(), state, _OPTIONAL_KEYS)
-        everyone = torch.ones(self.batch_size, dtype=torch.bool)
+        everyone = torch.ones_like(self._begun)
         self._physics.reset(everyone)
         for key in _PHYSICS_KEYS:
             getattr(self._physics, key).copy_(state[key])
         self._step_count.copy_(state["step_count"])
         self._physics.forward()
-        self._start(everyone.nonzero()[:, 0])
+        self._start(everyone)
         self._last_place.copy_(state.get("place", self._last_place))
         self._observation.copy_(state.get("observation", self._observation))
 
@@ -183,25 +186,21 @@ class Starts:
     An initial state depends only on the row's seed and the episode, see `rng`.
     """
 
-    def __init__(self, config: VelocityConfig, model: mujoco.MjModel, num_envs: int) -> None:
+    def __init__(self, config: VelocityConfig, model: mujoco.MjModel) -> None:
         self._config, self._model = config, model
-        self._seeds = self._episodes = torch.full((num_envs,), -1)
-        self._qpos = torch.zeros(num_envs, model.nq, dtype=torch.float64)
-        self._qvel = torch.zeros(num_envs, model.nv, dtype=torch.float64)
+        self._keys: Tensor | None = None
+        self._drawn: tuple[Tensor, Tensor]
 
-    def take(self, seeds: Tensor, episodes: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return initial positions [R, nq] and velocities [R, nv] of the episodes of rows [R].
+    def take(self, seeds: Tensor, episodes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return initial positions [N, nq] and velocities [N, nv], valid in the rows of a mask.
 
         `seeds` and `episodes` are those of all rows, int64 [N].
         """
-        known = torch.equal(self._episodes[rows], episodes[rows])
-        if not (known and torch.equal(self._seeds, seeds)):
-            # the next episodes of the rows that go on are drawn too
-            self._seeds, self._episodes = seeds.clone(), episodes + 1
-            self._episodes[rows] = episodes[rows]
-            key = rng.fold(self._seeds, self._episodes)
-            self._qpos, self._qvel = draw_start(self._config, self._model, key)
-        return self._qpos[rows], self._qvel[rows]
+        # the next episodes of the rows that go on are drawn too
+        keys = rng.fold(seeds, episodes + ~mask)
+        if self._keys is None or ((self._keys != keys) & mask).any():
+            self._keys, self._drawn = keys, draw_start(self._config, self._model, keys)
+        return self._drawn
 
 
 def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,14 +209,14 @@ def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tu
     Positions are uniform within the noise scale around the model's. Velocities have the mean 0 and
     are uniform within the noise scale, or normal with it as standard deviation. All are float64.
     """
-    columns = torch.arange(model.nq + model.nv)
+    columns = torch.arange(model.nq + model.nv, device=key.device)
     if RUNNERS[config.robot].normal_velocities:
         positions = _symmetric(key[:, None], columns[: model.nq])
         velocities = rng.normal(key[:, None], columns[model.nq :])
     else:
         draws = _symmetric(key[:, None], columns)
         positions, velocities = draws.split([model.nq, model.nv], -1)
-    initial, scale = torch.from_numpy(model.qpos0.copy()), config.reset_noise_scale
+    initial, scale = torch.from_numpy(model.qpos0.copy()).to(key.device), config.reset_noise_scale
     return initial + scale * positions, scale * velocities
 
 
