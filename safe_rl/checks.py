@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import field
 from functools import cache, wraps
 from inspect import Parameter, Signature, isclass, signature
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
@@ -55,6 +56,12 @@ Weight = Annotated[float, Interval(ge=0, lt=1)]
 Text = Annotated[
     str, rule(lambda text: bool(text.strip()) and text.isprintable(), "a text of one line")
 ]
+
+
+def option(default: Any, help: str) -> Any:
+    """A field of a command's options; `default` may be a function that makes the default."""
+    kind = "default_factory" if callable(default) else "default"
+    return field(metadata={"help": help}, **{kind: default})
 
 
 def check_value(name: str, annotation: Any, value: Any) -> Any:

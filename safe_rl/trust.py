@@ -2,16 +2,21 @@
 
 A configuration may come with a run of another person. It can therefore name only what runs are
 built of: parts of this package, torch's optimisers, and what modules define that the user has
-named by ``import=``. This is directly in ``safe_rl/``, because all folders build something.
+named by ``import=``. A configuration lists these modules, but they are imported only if the command
+names them: opening another person's run does not run their code.
 """
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
 from pkgutil import resolve_name
-from shlex import quote
+from shlex import join, quote
 from typing import Any, cast
 
 import hydra.utils
@@ -60,6 +65,70 @@ def allow(module: str) -> None:
 def allowed() -> list[str]:
     """The user's modules that configurations may name, for other processes to import."""
     return [name for name in _ROOMS if name not in _PACKAGED]
+
+
+def import_modules(modules: str | Sequence[str] | None) -> None:
+    """Import modules, and let configurations name what they define.
+
+    Args:
+        modules: One, several or None: dotted names, also of modules in the current directory, or
+            paths of files.
+
+    Raises:
+        ValueError: If a module does not exist or cannot be imported, or if Python finds
+            another module of the same name.
+    """
+    for module in [modules] if isinstance(modules, str) else modules or ():
+        name, path = module, Path(f"{module.replace('.', '/')}.py")
+        if module.endswith(".py"):
+            path = Path(module).expanduser()
+            name = path.stem
+            if not path.is_file():
+                raise ValueError(f"import={module}: there is no such file.")
+        # the folder is added to the path: other processes import the module by its name
+        folder = str(Path.cwd() if name == module else path.resolve().parent)
+        if folder not in sys.path:
+            sys.path.append(folder)
+        loaded_from = _import(name, module)
+        if path.is_file() and Path(loaded_from).resolve() != path.resolve():
+            raise ValueError(
+                f"import={module}: Python has another module of that name, "
+                f"{loaded_from}. Rename yours."
+            )
+        allow(name)
+
+
+def _import(name: str, given: str) -> str:
+    """Import a module; return its file, or "" if it has none."""
+    try:
+        return import_module(name).__file__ or ""
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == name.partition(".")[0]:
+            raise ValueError(
+                f"import={given}: there is no module '{error.name}' here or among the installed "
+                f"ones. A file is named by its path: import=folder/{error.name}.py."
+            ) from None
+        frames = traceback.extract_tb(error.__traceback__)
+        # the user's own line, not the line of this package that refuses its arguments
+        users = [frame for frame in frames if not _is_inner(frame.filename)]
+        place = f" ({users[-1].filename}, line {users[-1].lineno})" if users else ""
+        raise ValueError(f"import={given}: {type(error).__name__}: {error}{place}.") from error
+
+
+def _is_inner(file: str) -> bool:
+    """Whether code is of this package or of Python's import."""
+    return file.startswith(str(Path(__file__).parent)) or "importlib" in file
+
+
+def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:
+    """Refuse to open a run that has used modules of its own, unless ``import=`` is given."""
+    noted = config.get("import") or []
+    if given is None and noted:
+        words = join(f"import={module}" for module in noted)
+        raise ValueError(
+            f"{run} was trained with {words}: add that to the command if you trust this code, or "
+            f"'import=[]' to go without. In Python: safe_rl.load(…, imports=[…])."
+        )
 
 
 def instantiate(

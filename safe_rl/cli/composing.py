@@ -27,7 +27,6 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.config import General, keys_of, unknown_key
-from safe_rl.cli.user_code import check_imports
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.envs.safety_gym.config import KEYS
@@ -36,6 +35,7 @@ from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.identity import differences, flatten
 from safe_rl.runs.run import Run
+from safe_rl.trust import check_imports
 
 _MOST_LISTED = 40
 RESUMED = "resumed"

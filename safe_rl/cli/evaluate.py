@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from safe_rl.cli.options import OptionError, run_command
-from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.runs.run import Run
+from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
     from safe_rl.evaluation import Evaluation

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from safe_rl.checks import option
 from safe_rl.cli.options import OptionError, run_command
-from safe_rl.cli.user_code import check_imports, import_modules
-from safe_rl.evaluation.settings import option
+from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
     from safe_rl.cli.python_api import Run

@@ -33,7 +33,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.checks import check_value
-from safe_rl.cli.user_code import split_imports
 from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
@@ -115,6 +114,24 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     value = value.tolist() if hasattr(value, "tolist") else value  # of NumPy or torch
     return str(value) if isinstance(value, Path) else value
+
+
+def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Split words into the values of all ``name=value``, and the other words."""
+    given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
+    others = [word for word in words if word not in given]
+    return [word.partition("=")[2] for word in given], others
+
+
+def split_imports(words: Sequence[str]) -> tuple[list[str] | None, list[str]]:
+    """Separate ``import=``, which may be repeated or hold a list, from the other words.
+
+    Returns:
+        The modules, or None if ``import=`` is not given; and the other words.
+    """
+    given, others = take_word("import", words)
+    modules = [name.strip() for text in given for name in text.strip("[]").split(",")]
+    return (list(dict.fromkeys(filter(None, modules))) if given else None), others
 
 
 def usage(command: str, schema: type[DataclassInstance]) -> str:

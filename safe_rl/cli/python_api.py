@@ -32,7 +32,6 @@ from safe_rl.cli.composing import (
 from safe_rl.cli.config import check_settings
 from safe_rl.cli.evaluate import evaluate_run, evaluate_varied
 from safe_rl.cli.options import make_options
-from safe_rl.cli.user_code import check_imports, import_modules
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
@@ -46,6 +45,7 @@ from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
 from safe_rl.training.finish import certify_run
 from safe_rl.training.train import Callback
+from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
     import pandas

@@ -23,12 +23,12 @@ from omegaconf import DictConfig
 
 from safe_rl.cli.composing import name_choices
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.user_code import import_modules
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.outcome import LINE_SECONDS, violation
 from safe_rl.runs.run import Run
+from safe_rl.trust import import_modules
 
 _GRACE = 30.0
 """Seconds in which a job whose sweep was killed may end its epoch and write a checkpoint."""

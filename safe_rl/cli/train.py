@@ -31,13 +31,13 @@ from safe_rl.cli.composing import (
     refuse_changes,
 )
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.options import end_by_interrupt, keep_streams
+from safe_rl.cli.options import end_by_interrupt, keep_streams, split_imports, take_word
 from safe_rl.cli.sweeps import run_in_sweep
-from safe_rl.cli.user_code import import_modules, split_imports, take_word
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF, printable
 from safe_rl.naming import did_you_mean
 from safe_rl.scores.benchmark import SLATES
+from safe_rl.trust import import_modules
 
 
 def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -11,7 +11,7 @@ from annotated_types import Interval
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from safe_rl.checks import Fraction, SettingError, Share, check_value, rule
+from safe_rl.checks import Fraction, SettingError, Share, check_value, option, rule
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 
@@ -37,12 +37,6 @@ _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )
 _NAME = rule(lambda v: "/" not in v and v.isprintable(), "a part of files' names, without /")
-
-
-def option(default: Any, help: str) -> Any:
-    """A field of a command's options; `default` may be a function that makes the default."""
-    kind = "default_factory" if callable(default) else "default"
-    return field(metadata={"help": help}, **{kind: default})
 
 
 @dataclass

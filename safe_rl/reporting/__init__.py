@@ -1,5 +1,5 @@
 """Reports: figures and tables of a folder of runs, on one page."""
 
-from safe_rl.reporting.page import Look, Report, build_report, write_report
+from safe_rl.reporting.page import Report, ReportOptions, build_report, write_report
 
-__all__ = ["Look", "Report", "build_report", "write_report"]
+__all__ = ["Report", "ReportOptions", "build_report", "write_report"]

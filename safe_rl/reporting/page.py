@@ -6,16 +6,19 @@ import base64
 import datetime
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from itertools import chain, count, groupby, starmap
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import yaml
+from annotated_types import Interval
 from matplotlib.figure import Figure
+from pydantic import PositiveInt
 
+from safe_rl.checks import option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 from safe_rl.reporting import figures, scoring, slates
@@ -29,7 +32,7 @@ from safe_rl.reporting.curves import (
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.tables import Table, clean, short_number
 from safe_rl.runs.curves import save_figure
-from safe_rl.scores.benchmark import SLATES, Suite
+from safe_rl.scores.benchmark import SEEDS, SLATES, Suite
 
 _MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed page
 _MOST_CURVES = 6  # in one panel
@@ -38,23 +41,35 @@ _TEXTS = yaml.safe_load(files(__package__).joinpath("texts.yaml").read_text(enco
 _SYMBOL = re.compile(r"\$(\\bar )?(\\rho|\w)(?:_(\w))?\$")  # such as $\bar J_r$
 
 
-@dataclass(frozen=True)
-class Look:
-    """How a report is written.
+FORMATS = ("png", "svg", "pdf")
+_FORMATS = rule(
+    lambda text: set(listed(text)) <= set(FORMATS), f"one or more of {', '.join(FORMATS)}"
+)
 
-    Attributes:
-        formats: Formats of the pictures: png, svg, pdf. PNG is always written, for the page.
-        width: Width of the pictures [inch].
-        panels: Whether every panel of a picture has a file of its own, too.
-        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
-        columns: Columns of the tables in LaTeX, such as ``algorithm`` and ``J_c``; empty: all.
-    """
 
-    formats: Sequence[str] = ("png",)
-    width: float = figures.WIDTH
-    panels: bool = False
-    labels: Mapping[str, str] = field(default_factory=dict)
-    columns: Sequence[str] = ()
+@dataclass
+class ReportOptions:
+    """Options of ``safe-rl report``; their help texts describe them."""
+
+    out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
+    seeds: PositiveInt = option(len(SEEDS), "finished runs per environment that a slate needs")
+    algos: str | None = option(None, "algorithms to report, such as cpo,ppo_lagrangian; null: all")
+    baselines: str | None = option(
+        None, "other runs to put beside these: archives or folders, such as results/held_out"
+    )
+    unfinished: bool = option(False, "include unfinished runs in scores")
+    archive: str | None = option(None, "campaign archive to add the runs to; null: none")
+    title: str | None = option(None, "heading; null: the folder's name")
+    formats: Annotated[str, _FORMATS] = option("png", "of the pictures, such as png,svg,pdf")
+    width: Annotated[float, Interval(ge=2, le=40)] = option(figures.WIDTH, "of the pictures [inch]")
+    panels: bool = option(False, "write every panel of a picture to a file of its own, too")
+    labels: dict[str, str] = option(dict, "names to show, such as '{cpo: CPO (ours)}'")
+    columns: str | None = option(None, "columns of tables.tex, such as algorithm,J_r,J_c")
+
+
+def listed(text: str | None) -> list[str]:
+    """The parts of an option's text, which commas separate."""
+    return list(filter(None, map(str.strip, (text or "").split(","))))
 
 
 class Drawing(NamedTuple):
@@ -99,45 +114,30 @@ class Report:
         return [run for run in runs if not run.source]
 
 
-def build_report(
-    root: Path,
-    suite: Suite,
-    *,
-    seeds_needed: int,
-    unfinished: bool,
-    algorithms: Sequence[str] = (),
-    baselines: Sequence[Path] = (),
-    look: Look = Look(),  # noqa: B008, it is frozen
-) -> Report:
+def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     """Find the runs below a folder, and make the sections of a report.
 
-    Args:
-        root: The folder.
-        suite: The benchmark.
-        seeds_needed: Finished runs per environment that a slate needs.
-        unfinished: Whether unfinished runs count as finished ones.
-        algorithms: Names in ``conf/algo`` of the algorithms to report; empty: all.
-        baselines: Folders or archives of other runs, which are put beside these where they have the
-            same environments; they keep the name of their folder.
-        look: How it is written.
+    Baselines are put beside these runs where they have the same environments; they keep the name of
+    their folder.
 
     Raises:
         FileNotFoundError: If there is no run.
         ValueError: If one of the algorithms has no run.
     """
-    runs, skipped = find_runs(root, unfinished=unfinished)
+    runs, skipped = find_runs(root, unfinished=options.unfinished)
+    algorithms, width = listed(options.algos), options.width
     known = sorted({run.algorithm for run in runs})
     for name in algorithms:
         if name not in known:
             raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
-    chosen += _baselines(baselines, {run.environment for run in chosen})
-    experiments, repeated = group_runs(chosen, suite, look.labels)
+    chosen += _baselines(listed(options.baselines), {run.environment for run in chosen})
+    experiments, repeated = group_runs(chosen, suite, options.labels)
     skipped |= repeated
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [scoring.final_table(group) for group in groups]
-    complete = slates.complete_slates(experiments, seeds_needed)
+    complete = slates.complete_slates(experiments, options.seeds)
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
@@ -147,11 +147,11 @@ def build_report(
             "curves",
             "Learning curves",
             [
-                *benchmark_figures(experiments, look.width),
-                *_curves(experiments, styles, look.width),
+                *benchmark_figures(experiments, width),
+                *_curves(experiments, styles, width),
             ],
         ),
-        ("fronts", "Return against cost", _fronts(groups, finals, styles, look.width)),
+        ("fronts", "Return against cost", _fronts(groups, finals, styles, width)),
         (
             "normalised",
             "Normalised scores",
@@ -169,10 +169,10 @@ def build_report(
     return Report(experiments, [s for s in sections if s.blocks], skipped)
 
 
-def _baselines(places: Sequence[Path], environments: Collection[str]) -> list[Run]:
+def _baselines(places: Sequence[str], environments: Collection[str]) -> list[Run]:
     """Finished runs of other folders in some environments, with the names of their folders."""
     runs = []
-    for place in places:
+    for place in (Path(place).expanduser() for place in places):
         for run in find_runs(place)[0]:
             if run.environment in environments and run.is_finished:
                 run.source = clean(place.resolve().name, 40)
@@ -240,7 +240,7 @@ def _curves(experiments: Sequence[Experiment], styles: Styles, width: float) -> 
     return drawings
 
 
-def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> Path:  # noqa: B008
+def write_report(report: Report, out: Path, title: str, options: ReportOptions) -> Path:
     """Write a report into a folder: a page, pictures, tables as CSV and all of them in LaTeX.
 
     ``curves.csv`` has the points of all learning curves, a row for each.
@@ -250,7 +250,7 @@ def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> 
         out: The folder; it is made if it does not exist, and files of an earlier report are
             replaced.
         title: Heading of the page.
-        look: How it is written.
+        options: How it is written.
 
     Returns:
         Path of the page, ``report.html``.
@@ -261,8 +261,9 @@ def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> 
     jinja2 = import_extra("jinja2", "report")
     out.mkdir(parents=True, exist_ok=True)
     place = _places(out)
+    columns = listed(options.columns)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
-    replace_text(out / "tables.tex", "\n".join(table.latex(look.columns) for table in tables))
+    replace_text(out / "tables.tex", "\n".join(table.latex(columns) for table in tables))
     curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
     curves.write_csv(out / "curves.csv")
     environment = jinja2.Environment(
@@ -278,7 +279,7 @@ def write_report(report: Report, out: Path, title: str, look: Look = Look()) -> 
         date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         facts=_facts(report),
         texts=_TEXTS,
-        sections=[(s, [(b, _write(b, place, look)) for b in s.blocks]) for s in report.sections],
+        sections=[(s, [(b, _write(b, place, options)) for b in s.blocks]) for s in report.sections],
     )
     replace_text(out / "report.html", text)
     return out / "report.html"
@@ -297,17 +298,17 @@ def _places(out: Path) -> Callable[[str], Path]:
     return place
 
 
-def _write(block: Block, place: Callable[[str], Path], look: Look) -> str:
+def _write(block: Block, place: Callable[[str], Path], options: ReportOptions) -> str:
     """Write the files of a block; return the PNG of a picture in base64, for the page."""
     if isinstance(block, Table):
         block.write_csv(place(block.name).with_suffix(".csv"))
     if not isinstance(block, Drawing):
         return ""
-    path = place(block.name)
-    for form in {*look.formats, "png"}:
+    path, formats = place(block.name), listed(options.formats)
+    for form in {*formats, "png"}:  # the page needs PNG
         save_figure(block.figure, path.with_suffix(f".{form}"))
-    if look.panels:
-        figures.save_panels(block.figure, path, look.formats)
+    if options.panels:
+        figures.save_panels(block.figure, path, formats)
     return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 

@@ -28,8 +28,10 @@ WRONG: list[Any] = [
 
 @cache
 def config_of(algo: str) -> Any:
-    """The configuration of an algorithm for the point mass."""
-    return compose_config(f"algo={algo}", "env=PointMass", "model.hidden_sizes=[4]")
+    """The checked configuration of an algorithm for the point mass."""
+    config = compose_config(f"algo={algo}", "env=PointMass", "model.hidden_sizes=[4]")
+    check_settings(config)
+    return config
 
 
 def nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -42,9 +44,7 @@ def nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_every_setting_of_every_part_has_a_range_or_choices(algo):
-    config = config_of(algo).copy()
-    check_settings(config)
-    for path, node in nodes(config):
+    for path, node in nodes(config_of(algo)):
         if not str(node.get("_target_")).startswith("safe_rl.") or path == "algo":
             continue
         known = parameters_of(trust.locate(node._target_))

@@ -9,12 +9,13 @@ from run_configs import point_mass_config
 
 from safe_rl import trust
 from safe_rl.cli.composing import read_resumed
-from safe_rl.cli.user_code import check_imports, import_modules, split_imports
+from safe_rl.cli.options import split_imports
 from safe_rl.envs import complete_env, make_env
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
 from safe_rl.training.building import build_trainer
 from safe_rl.training.train import SETTING_ERRORS
+from safe_rl.trust import check_imports, import_modules
 
 MODULE = """
 import pathlib

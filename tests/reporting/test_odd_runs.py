@@ -9,7 +9,7 @@ from synthetic import SUITE, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.files import printable
-from safe_rl.reporting import build_report
+from safe_rl.reporting import ReportOptions, build_report
 
 SECRET = "hush-hush"
 EPOCHS = {"returns": (1.0, 2.0), "costs": (30.0, 20.0), "rates": (0.03, 0.02)}
@@ -98,7 +98,7 @@ def report(tmp_path, damages):
     for number, damage in enumerate(damages):
         damage(write_run(root, seed=number + 1, folder=f"odd{number}", **EPOCHS))
     assert main([str(root), "seeds=1"]) == 0
-    found = build_report(root, SUITE, seeds_needed=1, unfinished=False)
+    found = build_report(root, SUITE, ReportOptions(seeds=1))
     texts = [path.read_bytes() for path in (root / "report").iterdir()]
     assert not any(SECRET.encode() in text for text in texts)
     html = (root / "report/report.html").read_text()

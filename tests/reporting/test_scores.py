@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import SUITE, experiments_in, marks, texts_of, write_run
 
-from safe_rl.reporting.page import Drawing, build_report
+from safe_rl.reporting.page import Drawing, ReportOptions, build_report
 from safe_rl.reporting.scoring import final_record, final_table
 from safe_rl.reporting.slates import complete_slates, normalised_scores, paper_table, slate_table
 from safe_rl.reporting.tables import Table
@@ -89,7 +89,7 @@ def test_seeds_that_have_not_come_equally_far_are_not_ranked_with_those_that_hav
     for seed in (0, 10):
         for algo in ("trpo_lagrangian", "ppo_lagrangian"):
             write_run(tmp_path, algo=algo, seed=seed, **long)
-    report = build_report(tmp_path, SUITE, seeds_needed=2, unfinished=True)
+    report = build_report(tmp_path, SUITE, ReportOptions(seeds=2, unfinished=True))
     tables = {b.name: b for s in report.sections for b in s.blocks if isinstance(b, Table)}
     drawn = {b.name: b.shows for s in report.sections for b in s.blocks if isinstance(b, Drawing)}
     final = tables["final_PointGoal1"]
@@ -210,7 +210,7 @@ def test_what_counts_towards_no_slate(changes, tmp_path):
     """Continued runs, other environments, limits on other costs, and runs that go on."""
     for env in SLATES["SG6"]:
         write_run(tmp_path, env, "cpo", **changes)
-    result = build_report(tmp_path, SUITE, seeds_needed=1, unfinished=False)
+    result = build_report(tmp_path, SUITE, ReportOptions(seeds=1))
     assert "normalised" not in [section.name for section in result.sections]
 
 
