@@ -139,14 +139,6 @@ def test_how_far_off_the_cost_critics_are():
     assert f"{words} {min(costs):.0f} to {max(costs):.0f}." in said("docs/off_policy.md")
 
 
-def test_the_two_runs_on_a_gpu():
-    page = (ROOT / "docs" / "guides" / "gpu.md").read_text()
-    table = results.single("gpu")
-    for seed in ("0", "1321"):
-        end = re.search(rf"\| {seed} \|.*?\| (≤[\d. at]+) \|", table)[1]
-        assert end in page
-
-
 def test_coverage_counts_the_seeds_of_finished_runs():
     steps = {1: 3_000_000, 2: 3_000_000, 3: 1_000_000}
     of_runs = [SimpleNamespace(steps=n) for n in steps.values()]
