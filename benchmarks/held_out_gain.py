@@ -47,7 +47,7 @@ def restored(run: Path, directory: Path):
     """Trainer of a run at its newest checkpoint, with another seed for what comes."""
     config = OmegaConf.load(run / "config.yaml")
     trainer = build_trainer(config, new_env(config), directory)
-    CheckpointStore.load(Run(run).find_checkpoint("last"), trainer.components())
+    CheckpointStore.load(Run(run).find_checkpoint("last"), trainer.components)
     seed_everything(12_345, None)
     return trainer
 

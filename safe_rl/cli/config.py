@@ -201,25 +201,26 @@ def check_settings(config: DictConfig) -> None:
         SettingError: For a key that does not exist or is out of range; the message names it.
     """
     try:
-        _check_all(config)
+        with open_dict(config):
+            for name in [key for key in config if OmegaConf.is_missing(config, key)]:
+                del config[name]
+            if config.algo.get("constrained") is False:  # presets have limits for others
+                config.pop("limits", None)
+        _check_parts(config)
+        _check(General, config, "")
+        _check(Algo, config.algo, "algo", is_open=True)
+        _check(CertificateOptions, config.certificate, "certificate")
+        if not OmegaConf.is_dict(config.model) or "_target_" not in config.model:
+            _check(Model, config.model, "model")
+        check_value("env.name", Folder, config.env.name)
+        _check_together(config)
     except OmegaConfBaseException as error:  # such as an interpolation of a key that is not there
         line = str(error).partition("\n")[0]
         raise SettingError(f"{error.full_key}: {line}") from None
 
 
-def _check_all(config: DictConfig) -> None:
-    with open_dict(config):
-        for name in [key for key in config if OmegaConf.is_missing(config, key)]:
-            del config[name]
-        if config.algo.get("constrained") is False:  # presets have limits for other algorithms
-            config.pop("limits", None)
-    _check_parts(config)
-    _check(General, config, "")
-    _check(Algo, config.algo, "algo", is_open=True)
-    _check(CertificateOptions, config.certificate, "certificate")
-    if "_target_" not in config.model:
-        _check(Model, config.model, "model")
-    check_value("env.name", Folder, config.env.name)
+def _check_together(config: DictConfig) -> None:
+    """Refuse settings that are right by themselves and not together."""
     if not config.collector.get("_target_") and config.collector.get("num_collectors") != 1:
         raise SettingError(
             "collector.num_collectors: collector=local is one process; for more use "
@@ -251,9 +252,11 @@ def _check_parts(config: DictConfig) -> None:
             raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.")
 
 
-def _check(section: type, values: DictConfig, above: str, *, is_open: bool = False) -> None:
+def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> None:
     """Check the keys of a section, a dataclass; an open one may have others."""
     hints = get_type_hints(section, include_extras=True)
+    if not OmegaConf.is_dict(values):
+        raise SettingError(f"{above}={values}: it must have the keys {', '.join(hints)}.")
     for name, value in values.items():
         key = join_keys(above, str(name))
         if name not in hints:
@@ -261,20 +264,17 @@ def _check(section: type, values: DictConfig, above: str, *, is_open: bool = Fal
                 continue
             known = [join_keys(above, other) for other in hints] if above else keys_of(values)
             raise SettingError(unknown_key(key, known))
-        kinds = [*filter(_is_section, (hints[name], *get_args(hints[name])))]
-        if kinds and value is not None:
-            _check(kinds[0], value, key)
-        elif not kinds:
-            plain = (
-                OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-            )
+        # a section may be optional: a union of its dataclass and None
+        kinds = [k for k in (hints[name], *get_args(hints[name])) if isinstance(k, type)]
+        below = next(filter(is_dataclass, kinds), None)
+        if below is None:
+            is_plain = not OmegaConf.is_config(value)
+            plain = value if is_plain else OmegaConf.to_container(value, resolve=True)
             checked = check_value(key, hints[name], plain)
             if isinstance(value, float) and isinstance(checked, int):
                 values[name] = checked
-
-
-def _is_section(kind: Any) -> bool:
-    return isinstance(kind, type) and is_dataclass(kind)
+        elif value is not None:
+            _check(below, value, key)
 
 
 def keys_of(config: DictConfig) -> list[str]:

@@ -19,13 +19,13 @@ from hydra.conf import HydraConf
 from hydra.core.utils import JobReturn
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.cli.composing import name_choices
 from safe_rl.cli.config import check_settings
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
-from safe_rl.runs.identity import check_same_run
+from safe_rl.runs.identity import differences
 from safe_rl.runs.outcome import LINE_SECONDS, violation
 from safe_rl.runs.run import Run
 from safe_rl.trust import import_modules
@@ -81,12 +81,27 @@ def run_job(config: DictConfig, settings: HydraConf, run: Run) -> float:
 
     if run.is_run:
         complete(config, run)
-        check_same_run(run, config)
+        check_same_run(config, run)
     train(config, run.directory, hydra=settings, continues=True)
     figures, limits = run.final, run.cost_limits
     value = figures["episode_return"]
     is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
     return -math.inf if is_above or math.isnan(value) else value
+
+
+def check_same_run(config: DictConfig, run: Run) -> None:
+    """Refuse to continue a run with other settings; length and machine may differ.
+
+    Raises:
+        ValueError: If other settings differ; the message names every key.
+    """
+    given: Any = OmegaConf.to_container(config, resolve=True)
+    if changed := differences(run.settings, given):
+        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in changed.items())
+        raise ValueError(
+            f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
+            "the sweep another folder with hydra.sweep.dir=..."
+        )
 
 
 class Summary(Callback):

@@ -24,7 +24,7 @@ from safe_rl.files import read_bounded, read_config, read_json, read_yaml, repla
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
-from safe_rl.runs.identity import config_dirs, differences, repeating, select
+from safe_rl.runs.identity import config_dirs, differences, repeating, select, unusable_keys
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -69,7 +69,7 @@ class Run(folders.Run):
             Exception: Of any type, if notes are not as a run writes them.
         """
         given = {**self.settings, "cost_limits": self.settings.get("cost_limits") or {}}
-        wrong = folders.unusable_keys(given)
+        wrong = unusable_keys(given)
         wrong += [] if "frames" in given else ["frames"]
         if wrong:
             raise ValueError(

@@ -1,6 +1,6 @@
-"""Roles of a configuration's keys: which define the experiment, and which may change on resume.
+"""What the keys of a run's configuration mean, and which define its experiment.
 
-All code that compares runs uses this table: ``resume=``, sweeps with their folders, reports.
+All code that compares runs uses the roles of keys: ``resume=``, sweeps with their folders, reports.
 Hydra's notes of a run have the settings of its command line: its command is made again from them.
 """
 
@@ -10,16 +10,15 @@ import os
 import shlex
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from enum import Enum
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from safe_rl.files import PROGRAM, read_yaml
+from safe_rl.checks import is_number
+from safe_rl.files import PROGRAM
 from safe_rl.runs.folder import common_source
-from safe_rl.runs.run import Run
 
 
 class Role(Enum):
@@ -191,38 +190,32 @@ def _hashable(value: Any) -> Hashable:
     return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
 
 
-def given_settings(directory: Path, config: DictConfig) -> dict[str, Any]:
+def given_settings(overrides: Sequence[str], config: DictConfig) -> dict[str, Any]:
     """Environment, algorithm and seed of a run, and the settings of its command line.
 
     Keys that belong to the machine are left out. Lists and mappings are written as texts.
 
     Args:
-        directory: Folder of the run; without Hydra's notes in it there are no other settings.
+        overrides: Those of its command line.
         config: Configuration of the run.
     """
-    notes = Run(directory).overrides_file
-    texts = read_yaml(notes) if notes.exists() else []
     given = {}
-    for override in OverridesParser.create().parse_overrides(texts):
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
         key, value = override.key_or_group, override.value()
         if role_of(key) is not Role.MACHINE:
             given[key] = value if isinstance(value, bool | int | float | str) else str(value)
     return given | {"env": config.env.name, "algo": config.algo.name, "seed": config.seed}
 
 
-def check_same_run(run: Run, config: DictConfig) -> None:
-    """Refuse to continue a run with other settings; length and machine may differ.
+def measure_of(settings: Any) -> str:
+    """Which measure of episode costs a configuration limits: ``mean``, or the risk's class.
 
-    Raises:
-        ValueError: If other settings differ; the message names every key.
+    Examples:
+        >>> measure_of({"risk": {"_target_": "safe_rl.objectives.CVaR"}}), measure_of({})
+        ('CVaR', 'mean')
     """
-    given = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
-    if changed := differences(run.settings, given):
-        changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in changed.items())
-        raise ValueError(
-            f"{run.directory} holds a run with other settings ({changes}). Move it away, or give "
-            "the sweep another folder with hydra.sweep.dir=..."
-        )
+    target = (settings.get("risk") or {}).get("_target_") or "mean"
+    return str(target).rpartition(".")[2]
 
 
 def is_to_keep_limits(config: DictConfig) -> bool:
@@ -230,6 +223,36 @@ def is_to_keep_limits(config: DictConfig) -> bool:
     transforms = (config.get("transforms") or {}).values()
     is_constrained = config.algo.get("constrained") is not False
     return is_constrained or any("budgets" in transform for transform in transforms)
+
+
+def unusable_keys(settings: dict[str, Any]) -> list[str]:
+    """Keys of a configuration that are missing, or that no run would have like this.
+
+    Examples:
+        >>> good = {"env": {}, "algo": {"name": "cpo"}, "seed": 0, "cost_limits": {"cost": 25}}
+        >>> unusable_keys(good), unusable_keys(good | {"import": 5, "algo": 3})
+        ([], ['algo', 'import'])
+    """
+    env, algo = settings.get("env"), settings.get("algo")
+    limits, frames = settings.get("cost_limits"), settings.get("frames", 0)
+    modules = settings.get("import") or []
+    groups = ("transforms", "risk", "checkpoint", "certificate", "collector", "hydra")
+    usable = {
+        "env": isinstance(env, dict) and _is_name(env.get("name", "")),
+        "algo": isinstance(algo, dict) and _is_name(algo.get("name", 0)),
+        "seed": type(settings.get("seed")) is int,
+        "cost_limits": isinstance(limits, dict) and all(map(is_number, limits.values())),
+        "frames": is_number(frames) and frames >= 0,
+        "import": isinstance(modules, list) and all(isinstance(name, str) for name in modules),
+        "init_from": isinstance(settings.get("init_from"), str | None),
+        **{key: isinstance(settings.get(key), dict | None) for key in groups},
+    }
+    return [key for key, is_usable in usable.items() if not is_usable]
+
+
+def _is_name(value: Any) -> bool:
+    """Whether a value is a name, which as a part of a path cannot lead out of a folder."""
+    return isinstance(value, str) and not value.startswith("/") and ".." not in value.split("/")
 
 
 def select(node: Any, *keys: str) -> Any:

@@ -14,9 +14,9 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.checks import is_number
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
+from safe_rl.runs.identity import measure_of, unusable_keys
 from safe_rl.runs.outcome import final_figures, measured, outcome_line
 from safe_rl.runs.table import MOST_BYTES, read_table
 
@@ -352,44 +352,3 @@ def find_runs(root: Path, most: int | None = None) -> list[Run]:
     """Runs below a folder, itself included, in the order of their paths; see `paths_below`."""
     folders = (path.parent for path in paths_below(root, Run.config_file.name, most))
     return [Run(folder) for folder in folders if folder.name != Run.notes_folder.name]
-
-
-def measure_of(settings: Any) -> str:
-    """Which measure of episode costs a configuration limits: ``mean``, or the risk's class.
-
-    Examples:
-        >>> measure_of({"risk": {"_target_": "safe_rl.objectives.CVaR"}}), measure_of({})
-        ('CVaR', 'mean')
-    """
-    target = (settings.get("risk") or {}).get("_target_") or "mean"
-    return str(target).rpartition(".")[2]
-
-
-def unusable_keys(settings: dict[str, Any]) -> list[str]:
-    """Keys of a configuration that are missing, or that no run would have like this.
-
-    Examples:
-        >>> good = {"env": {}, "algo": {"name": "cpo"}, "seed": 0, "cost_limits": {"cost": 25}}
-        >>> unusable_keys(good), unusable_keys(good | {"import": 5, "algo": 3})
-        ([], ['algo', 'import'])
-    """
-    env, algo = settings.get("env"), settings.get("algo")
-    limits, frames = settings.get("cost_limits"), settings.get("frames", 0)
-    modules = settings.get("import") or []
-    groups = ("transforms", "risk", "checkpoint", "certificate", "collector", "hydra")
-    usable = {
-        "env": isinstance(env, dict) and _is_name(env.get("name", "")),
-        "algo": isinstance(algo, dict) and _is_name(algo.get("name", 0)),
-        "seed": type(settings.get("seed")) is int,
-        "cost_limits": isinstance(limits, dict) and all(map(is_number, limits.values())),
-        "frames": is_number(frames) and frames >= 0,
-        "import": isinstance(modules, list) and all(isinstance(name, str) for name in modules),
-        "init_from": isinstance(settings.get("init_from"), str | None),
-        **{key: isinstance(settings.get(key), dict | None) for key in groups},
-    }
-    return [key for key, is_usable in usable.items() if not is_usable]
-
-
-def _is_name(value: Any) -> bool:
-    """Whether a value is a name, which as a part of a path cannot lead out of a folder."""
-    return isinstance(value, str) and not value.startswith("/") and ".." not in value.split("/")

@@ -17,9 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.checks import SettingError
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.folder import lock_folder
-from safe_rl.runs.identity import given_settings
+from safe_rl.runs.identity import given_settings, measure_of
 from safe_rl.runs.outcome import ProgressBar, outcome_line
-from safe_rl.runs.run import Run, measure_of
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableWriter, read_table
 from safe_rl.trust import instantiate
 
@@ -83,7 +83,8 @@ class RunWriter:
             table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             self._table = opened.enter_context(table)
             if self._logger is not None and not epoch:
-                self._logger.log_hparams(given_settings(self.directory, self._config))
+                given = given_settings(self.run.overrides or (), self._config)
+                self._logger.log_hparams(given)
             # whole batches, so that the last one does not go beyond the bar
             batch = self._config.frames_per_batch
             total = math.ceil(self._config.frames / batch) * batch

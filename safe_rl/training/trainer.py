@@ -19,8 +19,8 @@ from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.writing import RunWriter
-from safe_rl.training.checkpoint_selection import CheckpointSelection, epochs_until_evaluated
 from safe_rl.training.state import (
+    CheckpointSelection,
     EnvSnapshot,
     Progress,
     RandomGenerators,
@@ -49,6 +49,11 @@ class Trainer:
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Periodic evaluation of the policy, called after every epoch, or None.
         recording: Writes every batch to disk, or None.
+
+    Attributes:
+        components: The parts of a checkpoint by name.
+        stopped_by: The signal that has ended the run, if any.
+        callbacks: Called after every epoch with its row; one that returns False ends the run.
     """
 
     def __init__(
@@ -72,53 +77,24 @@ class Trainer:
             longest=env.max_episode_steps,
             steps_per_decision=env.steps_per_decision,
         )
-        self.progress = Progress()
-        self.writer = writer
+        self.progress, self.writer, self.env = Progress(), writer, env
         self.stopped_by: Signals | None = None
         self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
-        self._collector = collector
-        self.env = env
+        self._collector, self._is_continued = collector, False
         self._evaluation, self._recording = evaluation, recording
         # the environments of workers are in other processes
         self._snapshot = None
         if isinstance(collector, Collector) and env.get_state() is not None:
             self._snapshot = EnvSnapshot(env, collector)
-        self._is_continued = False
         self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
         if self._first_steps is not None:
             (self._snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
-        self._frames, self._frames_per_batch = config.frames, config.frames_per_batch
-        self._checkpoint_interval = config.checkpoint.interval
-        self._selection = self._make_selection(config.checkpoint.best_over, cost_limits)
-        self._checkpoints = self._open_checkpoints(config)
+        self._frames, self._checkpoint_interval = config.frames, config.checkpoint.interval
+        self._open_checkpoints(config, cost_limits)
 
-    def _open_checkpoints(self, config: DictConfig) -> CheckpointStore:
-        run = {"environment": config.env.name, "algorithm": config.algo.name, "seed": config.seed}
-        return CheckpointStore(
-            self.writer.run.checkpoints_folder,
-            self.components(),
-            keep_last=config.checkpoint.keep_last,
-            keep_best=config.checkpoint.keep_best,
-            run=run,
-            interface=lambda: self.env.interface,
-        )
-
-    def _make_selection(self, over: int, limits: Mapping[str, float]) -> CheckpointSelection:
-        steps = self._frames_per_batch / self.env.batch_size.numel()
-        return CheckpointSelection(
-            {name: part for name, part in self._parts().items() if name not in _FOR_RESUMING},
-            limits,
-            over=over,
-            delay=lambda length: epochs_until_evaluated(over, length, steps),
-            longest=self.env.max_episode_steps,
-        )
-
-    def components(self) -> dict[str, Stateful]:
-        """The parts of a checkpoint by name."""
-        return {**self._parts(), "candidates": self._selection}
-
-    def _parts(self) -> dict[str, Stateful]:
+    def _open_checkpoints(self, config: DictConfig, cost_limits: Mapping[str, float]) -> None:
+        """Name the parts of a checkpoint, choose those of a policy, and open the run's store."""
         parts: dict[str, Stateful] = {
             **self.algorithm.checkpoint_components(),
             "accounting": self.accounting,
@@ -127,7 +103,23 @@ class Trainer:
         }
         if self._snapshot is not None:
             parts["env"] = self._snapshot
-        return parts
+        self._selection = CheckpointSelection(
+            {name: part for name, part in parts.items() if name not in _FOR_RESUMING},
+            cost_limits,
+            over=config.checkpoint.best_over,
+            steps_per_epoch=config.frames_per_batch / self.env.batch_size.numel(),
+            longest=self.env.max_episode_steps,
+        )
+        about = {"environment": config.env.name, "algorithm": config.algo.name, "seed": config.seed}
+        self.components = {**parts, "candidates": self._selection}
+        self._checkpoints = CheckpointStore(
+            self.writer.run.checkpoints_folder,
+            self.components,
+            keep_last=config.checkpoint.keep_last,
+            keep_best=config.checkpoint.keep_best,
+            run=about,
+            interface=lambda: self.env.interface,
+        )
 
     def resume(self) -> bool:
         """Continue the run in the folder from its newest checkpoint, if there is one.

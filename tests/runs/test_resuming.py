@@ -16,10 +16,10 @@ from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.cli.sweeps import check_same_run
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError
-from safe_rl.runs.identity import check_same_run
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
@@ -209,8 +209,8 @@ def test_a_table_that_lacks_epochs_is_refused(tmp_path):
 
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
     point_mass_trainer(tmp_path).run()
-    check_same_run(Run(tmp_path), point_mass_config())
+    check_same_run(point_mass_config(), Run(tmp_path))
     longer, other = point_mass_config("frames=9000", "num_threads=2"), point_mass_config("seed=1")
-    check_same_run(Run(tmp_path), longer)
+    check_same_run(longer, Run(tmp_path))
     with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):
-        check_same_run(Run(tmp_path), other)
+        check_same_run(other, Run(tmp_path))

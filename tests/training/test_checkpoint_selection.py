@@ -1,12 +1,10 @@
 """The best policies: evaluated by episodes whose policies are known by construction."""
 
-import functools
-
 import pytest
 import torch
 
 from safe_rl.runs.outcome import keeps
-from safe_rl.training.checkpoint_selection import CheckpointSelection, epochs_until_evaluated
+from safe_rl.training.state import CheckpointSelection
 
 EPISODE = 1000
 
@@ -47,8 +45,8 @@ def epochs(values, rows, steps):
 def evaluate(values, rows, steps, over=3):
     """Scores by the number of the policy."""
     policy = Policy()
-    delay = functools.partial(epochs_until_evaluated, over, steps_per_epoch=steps)
-    selection = CheckpointSelection({"policy": policy}, {}, over=over, delay=delay, longest=EPISODE)
+    options = {"over": over, "steps_per_epoch": steps, "longest": EPISODE}
+    selection = CheckpointSelection({"policy": policy}, {}, **options)
     evaluated = []
     for row in epochs(values, rows, steps):
         # what collected this batch was policy epoch − 1; the update makes it the next one
@@ -76,15 +74,15 @@ def test_a_single_epoch_of_whole_episodes_judges_the_policy_that_played_them():
 
 
 def test_limits_are_held_against_the_mean_of_the_epochs():
-    selection = CheckpointSelection({}, {"cost": 25.0}, over=2, delay=lambda length: 1, longest=1)
+    selection = CheckpointSelection({}, {"cost": 25.0}, over=2, steps_per_epoch=1, longest=1)
     kept = []
     for epoch, cost in enumerate((20.0, 28.0, 30.0, 16.0, 10.0), 1):
         row = {"epoch": epoch, "steps": epoch, "episode_return": 1.0, "episode_cost": cost}
         kept += [one["steps"] for one in selection.add(row)]
-    # means of 24, 29, 23, 13, of which each judges the policy of the epoch before
-    assert kept == [1, 3, 4]
-    assert [one["steps"] for one in selection.evaluate_all()] == [5]
-    assert [policy["steps"] for policy in selection.waiting] == [5]
+    # means of 29, 23, 13, of which each judges the policy of two epochs before
+    assert kept == [2, 3]
+    assert [one["steps"] for one in selection.evaluate_all()] == [4, 5]
+    assert [policy["steps"] for policy in selection.waiting] == [4, 5]
 
 
 @pytest.mark.parametrize(
@@ -97,7 +95,7 @@ def test_an_estimate_has_to_be_at_its_target_and_within_the_limit(estimate, targ
 
 
 def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
-    selection = CheckpointSelection({}, {"cost": 25.0}, over=1, delay=lambda length: 1, longest=1)
+    selection = CheckpointSelection({}, {"cost": 25.0}, over=1, steps_per_epoch=1, longest=1)
     row = {"epoch": 1, "steps": 1, "episode_return": 1.0}
     assert selection.add(row | {"episode_cost": 20.0}) == []
     assert [one["steps"] for one in selection.evaluate_all()] == [1]
@@ -108,14 +106,12 @@ def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
 def test_what_waits_is_a_copy_and_survives_a_checkpoint():
     network = torch.nn.Linear(1, 1)
     row = {"episode_return": 1.0}
-    first = CheckpointSelection({"network": network}, {}, over=1, delay=lambda length: 1, longest=1)
+    first = CheckpointSelection({"network": network}, {}, over=1, steps_per_epoch=1, longest=1)
     assert first.add({"epoch": 1, "steps": 1, **row}) == []
     before = network.weight.detach().clone()
     with torch.no_grad():
         network.weight.add_(1.0)
-    second = CheckpointSelection(
-        {"network": network}, {}, over=1, delay=lambda length: 1, longest=1
-    )
+    second = CheckpointSelection({"network": network}, {}, over=1, steps_per_epoch=1, longest=1)
     second.load_state_dict(first.state_dict())
     (evaluated,) = second.add({"epoch": 2, "steps": 2, **row})
     assert evaluated["steps"] == 1
@@ -123,15 +119,15 @@ def test_what_waits_is_a_copy_and_survives_a_checkpoint():
 
 
 def test_of_short_episodes_nobody_waits_as_if_they_were_long():
-    delay = functools.partial(epochs_until_evaluated, 1, steps_per_epoch=200)
-    selection = CheckpointSelection({}, {}, over=1, delay=delay, longest=1000)
+    options = {"over": 1, "steps_per_epoch": 200, "longest": 1000}
+    selection = CheckpointSelection({}, {}, **options)
     evaluated = []
     for epoch, length in enumerate((float("nan"), 1000.0, 1000.0, 50.0, 50.0, float("nan")), 1):
         row = {"epoch": epoch, "steps": epoch, "episode_return": epoch, "episode_length": length}
         evaluated.append([(one["steps"], one["score"]) for one in selection.add(row)])
     # the batch after their update, once it is known that episodes are short
     assert evaluated == [[], [], [], [(3, 4)], [(4, 5)], [(5, 6)]]
-    again = CheckpointSelection({}, {}, over=1, delay=delay, longest=1000)
+    again = CheckpointSelection({}, {}, **options)
     again.continue_after([{"episode_length": 50.0}])
     row = {"epoch": 7, "steps": 7, "episode_return": 7.0}
     assert [again.add(row), [one["steps"] for one in again.add(row | {"steps": 8})]] == [[], [7]]
