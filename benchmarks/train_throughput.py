@@ -15,6 +15,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+import safe_rl.cli.config  # noqa: F401, Hydra's ConfigStore gets the general keys
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import CONF
