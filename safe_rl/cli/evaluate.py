@@ -65,7 +65,7 @@ def evaluate_varied(
 
     directory = writable_copy(directory)
     varied = evaluate_variations(directory, options, progress=progress)
-    picture = Run(directory).variations_file(options.name, "png")
+    picture = Run(directory).evaluation_file(options.name, "png", "variations")
     draw_variations(varied.rows, varied.cost_limits, picture)
     return varied, picture
 

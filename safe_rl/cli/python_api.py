@@ -8,9 +8,7 @@ from __future__ import annotations
 import base64
 import html
 from collections.abc import Sequence
-from contextlib import suppress
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from signal import SIGINT
 from typing import TYPE_CHECKING, Any
@@ -40,6 +38,7 @@ from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded
 from safe_rl.models import HeldActions
 from safe_rl.runs.curves import Figure, learning_curves
+from safe_rl.runs.folder import new_folder
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
@@ -96,18 +95,18 @@ def train(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
-    if directory == "":
-        raise ValueError("directory is empty: it names the folder of the run.")
     if "resume" in settings:
         raise ValueError("safe_rl.resume(directory) continues a run.")
+    if directory == "" or "hydra.run.dir" in settings:
+        raise ValueError("directory=… names the folder of the run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = [imports] if isinstance(imports, str) else list(imports)
     import_modules(modules)
     more = {"import": modules} if modules else {}
     config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
     check_settings(config)
-    folder = new_folder(config.hydra) if directory is None else Path(directory).expanduser()
-    return _carry_out(config, folder, callbacks)
+    folder = new_folder(Path(config.hydra.run.dir)) if directory is None else directory
+    return _carry_out(config, Path(folder).expanduser(), callbacks)
 
 
 def resume(
@@ -146,24 +145,6 @@ def resume(
     config = compose_run(words, name=RESUMED)
     refuse_changes(folder.absolute(), config)
     return _carry_out(config, folder, callbacks, continues=True)
-
-
-def new_folder(hydra: DictConfig) -> Path:
-    """Make the folder of a new run; if it exists, its name gets a number.
-
-    A folder that an override names is used as it is.
-    """
-    if not hydra.run.dir:
-        raise ValueError("hydra.run.dir is empty: it names the folder of the run.")
-    wanted = Path(hydra.run.dir).expanduser().absolute()
-    if any(text.lstrip("+").startswith("hydra.run.dir=") for text in hydra.overrides.hydra):
-        return wanted
-    for number in count(1):
-        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
-        with suppress(FileExistsError):  # of a run that began in the same second
-            path.mkdir(parents=True)
-            break
-    return path
 
 
 def _carry_out(

@@ -26,8 +26,9 @@ from safe_rl.cli.config import check_settings
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import differences
-from safe_rl.runs.outcome import LINE_SECONDS, violation
 from safe_rl.runs.run import Run
+from safe_rl.runs.table import violation
+from safe_rl.runs.writing import LINE_SECONDS
 from safe_rl.trust import import_modules
 
 _GRACE = 30.0

@@ -245,7 +245,9 @@ def evaluate_variations(
     config = run.config
     config.env = override_env(config, options.env)
     checkpoint = run.find_checkpoint(options.checkpoint)
-    file, picture = (run.variations_file(options.name, kind) for kind in ("csv", "png"))
+    file, picture = (
+        run.evaluation_file(options.name, kind, "variations") for kind in ("csv", "png")
+    )
     check_places(directory, [file, picture])
     for variation in variations:  # wrong keys and layouts are found before the first episode
         if not variation.may_lack and (changed := varied(config, variation)) is not None:

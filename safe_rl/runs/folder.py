@@ -1,4 +1,4 @@
-"""Names of checkpoints and folders of runs, and the lock that allows one writer."""
+"""Folders of runs, names of their checkpoints, and the lock that allows one writer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from fnmatch import fnmatchcase
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from platform import node
 
@@ -96,6 +96,17 @@ def common_source(source: str) -> str:
     # the steps of the best one differ between seeds
     is_best = checkpoint.parent.name == "best"
     return str(shared / (checkpoint.parent if is_best else checkpoint))
+
+
+def new_folder(wanted: Path) -> Path:
+    """Make the folder of a new run; if it exists, its name gets a number."""
+    wanted = wanted.absolute()
+    for number in count(1):
+        path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
+        with suppress(FileExistsError):  # of a run that began in the same second
+            path.mkdir(parents=True)
+            break
+    return path
 
 
 class RunInUseError(ValueError):

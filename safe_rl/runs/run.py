@@ -17,8 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
 from safe_rl.runs.identity import measure_of, unusable_keys
-from safe_rl.runs.outcome import final_figures, measured, outcome_line
-from safe_rl.runs.table import MOST_BYTES, read_table
+from safe_rl.runs.table import MOST_BYTES, final_figures, measured, outcome_line, read_table
 
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
@@ -104,13 +103,9 @@ class Run:
         """The checkpoint of a kind with most steps, readable or not; None if there is none."""
         return next(reversed(self.checkpoints(kind)), None)
 
-    def evaluation_file(self, name: str, suffix: str) -> Path:
-        """A file of an evaluation, by its suffix: ``json``, ``csv``, ``mp4``, ``transitions``."""
-        return self.directory / f"{'_'.join(filter(None, ('evaluation', name)))}.{suffix}"
-
-    def variations_file(self, name: str, suffix: str) -> Path:
-        """A file of an evaluation under variations: ``csv`` the table, ``png`` the picture."""
-        return self.directory / f"{'_'.join(filter(None, ('variations', name)))}.{suffix}"
+    def evaluation_file(self, name: str, suffix: str, kind: str = "evaluation") -> Path:
+        """A file of an evaluation by its suffix, ``json`` or ``mp4``; ``kind``: or variations."""
+        return self.directory / f"{'_'.join(filter(None, (kind, name)))}.{suffix}"
 
     def logger_id_file(self, logger: str) -> Path:
         """The file with the id of this run in a logger's service."""

@@ -139,10 +139,10 @@ def test_errors_name_the_setting(settings, message, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_without_a_name_is_refused(tmp_path, monkeypatch):
+def test_a_folder_is_named_by_directory_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for settings in ({"directory": ""}, {"hydra.run.dir": ""}):
-        with pytest.raises(ValueError, match="is empty: it names the folder of the run"):
+    for settings in ({"directory": ""}, {"hydra.run.dir": "mine"}):
+        with pytest.raises(ValueError, match="directory=… names the folder of the run"):
             safe_rl.train(**settings)
     assert list(tmp_path.iterdir()) == []
 

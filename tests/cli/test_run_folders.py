@@ -5,35 +5,17 @@ from functools import partial
 
 import pytest
 from commands import SMALL, in_a_process, status_of
-from omegaconf import OmegaConf
 
-from safe_rl.cli.python_api import new_folder
-from safe_rl.runs.folder import RunInUseError
-
-
-def hydra_config(directory, *overrides):
-    node = {"run": {"dir": str(directory)}, "overrides": {"hydra": list(overrides)}}
-    return OmegaConf.create(node)
-
-
-def claim(directory):
-    return new_folder(hydra_config(directory))
+from safe_rl.runs.folder import RunInUseError, new_folder
 
 
 def test_runs_that_begin_in_the_same_second_get_folders_of_their_own(tmp_path):
     wanted = tmp_path / "PointGoal1" / "ppo" / "2026-01-31_12-00-00_seed0"
     with multiprocessing.get_context("fork").Pool(4) as pool:
-        made = pool.map_async(claim, [wanted] * 12).get(timeout=300)
+        made = pool.map_async(new_folder, [wanted] * 12).get(timeout=300)
     assert sorted(made) == sorted(wanted.parent.iterdir())
     assert wanted in made
     assert len(set(made)) == 12
-
-
-@pytest.mark.parametrize("override", ["hydra.run.dir", "+hydra.run.dir"])
-def test_a_folder_that_was_named_stays(tmp_path, override):
-    config = hydra_config(tmp_path, f"{override}={tmp_path}")
-    assert new_folder(config) == tmp_path
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_another_process_makes_first_stays(tmp_path, monkeypatch):

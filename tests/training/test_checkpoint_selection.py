@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from safe_rl.runs.outcome import keeps
+from safe_rl.runs.table import keeps
 from safe_rl.training.state import CheckpointSelection
 
 EPISODE = 1000
