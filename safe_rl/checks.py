@@ -16,6 +16,7 @@ from inspect import Parameter, Signature, isclass, signature
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from annotated_types import Interval
+from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -185,9 +186,12 @@ def checked(function: Function) -> Function:
     def checking(*args: Any, **kwargs: Any) -> Any:
         given = dict(zip(signature(function).parameters, args, strict=False)) | kwargs
         for name, check in checks().items():
-            if name in given and isinstance(given[name], _PLAIN):
-                value = check_value(name, check, given[name])
-                kwargs |= {name: value} if name in kwargs else {}
+            value = given.get(name, ...)
+            # a list of a configuration, as Hydra passes it, is no list for pydantic
+            plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+            if isinstance(plain, _PLAIN):
+                checked_value = check_value(name, check, plain)
+                kwargs |= {name: checked_value} if name in kwargs and plain is value else {}
         return function(*args, **kwargs)
 
     return checking  # type: ignore[return-value]

@@ -256,7 +256,7 @@ def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> 
     """Check the keys of a section, a dataclass; an open one may have others."""
     hints = get_type_hints(section, include_extras=True)
     if not OmegaConf.is_dict(values):
-        raise SettingError(f"{above}={values}: it must have the keys {', '.join(hints)}.")
+        raise SettingError(f"{above} must have the keys {', '.join(hints)}.")
     for name, value in values.items():
         key = join_keys(above, str(name))
         if name not in hints:

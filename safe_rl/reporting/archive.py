@@ -55,8 +55,7 @@ class Run(folders.Run):
         table: Mapping[str, list[float]],
         notes: Mapping[str, Any],
     ) -> None:
-        notes_of_run = {name: notes.get(name) for name in ("certificate", "evaluations", "code")}
-        super().__init__(directory, settings=settings, table=table, **notes_of_run)
+        super().__init__(directory, settings=settings, table=table)
         self.notes = notes
         overrides = notes.get("overrides")
         self.overrides = list(map(clean, overrides)) if isinstance(overrides, list) else None

@@ -6,10 +6,9 @@ their names.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
@@ -23,9 +22,6 @@ KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
 
 
-Value = TypeVar("Value")
-
-
 class _Below:
     """A file or folder of a run: ``run.table_file`` is its path, ``Run.table_file`` its name."""
 
@@ -36,17 +32,6 @@ class _Below:
         return Path(self._name) if run is None else run.directory / self._name
 
 
-class _Reread(Generic[Value]):
-    """A property that is read at every use, unless the run was given its value."""
-
-    def __init__(self, read: Callable[[Any], Value]) -> None:
-        self._read = read
-        self.__doc__ = read.__doc__
-
-    def __get__(self, run: Run, kind: type[Run]) -> Value:
-        return self._read(run)
-
-
 class Run:
     """One training run.
 
@@ -54,8 +39,7 @@ class Run:
 
     Args:
         directory: Its folder, which need not exist.
-        contents: Contents that have been read already, such as those of an archive: attribute ->
-            value.
+        contents: ``settings`` and ``table`` that have been read already, such as an archive's.
 
     Attributes:
         directory: Its folder; for an archived run, its name below the archive.
@@ -322,7 +306,7 @@ class Run:
 
     # certificate, evaluations, code
 
-    @_Reread
+    @property
     def certificate(self) -> dict[str, Any] | None:
         """The content of ``certificate.json``, or None if there is no such file."""
         if not self.certificate_file.is_file():
@@ -332,12 +316,12 @@ class Run:
             raise ValueError(f"{self.certificate_file} is not as a run writes it.")
         return content
 
-    @_Reread
+    @property
     def evaluations(self) -> list[dict[str, Any]]:
         """The contents of the files of all evaluations."""
         return [read_json(path) for path in self.evaluation_files]
 
-    @_Reread
+    @property
     def code(self) -> list[dict[str, Any]] | None:
         """The versions of the code that it used, with their first steps; None if not recorded."""
         return read_json(self.code_file) if self.code_file.is_file() else None
