@@ -245,6 +245,10 @@ def _check_parts(config: DictConfig) -> None:
         warnings.warn(
             f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
         )
+    for name in ("loss", "policy_update"):
+        part = config.get(name, "absent")
+        if part is None or (OmegaConf.is_dict(part) and part.get("_target_", "") is None):
+            raise SettingError(f"{name}._target_=null: algo={config.algo.name} needs its {name}.")
     for name in _PARTS:
         part = config.get(name)
         if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):

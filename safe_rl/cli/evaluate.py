@@ -12,18 +12,18 @@ from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
-    from safe_rl.evaluation import Evaluation
     from safe_rl.evaluation.variations import Varied
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
     """Run the command; return its exit status."""
-    return run_command(evaluate, arguments, f"{program} RUN_DIR", EvaluationOptions)
+    return run_command(carry_out, arguments, f"{program} RUN_DIR", EvaluationOptions)
 
 
-def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
+def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
     """Evaluate or certify a run, or run it under variations, and print the results."""
-    from safe_rl.evaluation.policies import find_run  # with torch: help does not need it
+    from safe_rl.evaluation import evaluate  # with torch: help does not need it
+    from safe_rl.evaluation.policies import find_run
 
     directory = find_run(words[0])
     check_imports(Run(directory).config, modules, directory)
@@ -34,45 +34,25 @@ def evaluate(words: list[str], options: EvaluationOptions, modules: list[str] | 
         varied, picture = evaluate_varied(directory, options, progress=True)
         print(varied, f"wrote {varied.file}", f"wrote {picture}", sep="\n")
     else:
-        print(evaluate_run(directory, options, progress=True))
+        print(evaluate(directory, options, progress=True))
     return 0
-
-
-def evaluate_run(
-    directory: Path, options: EvaluationOptions, *, progress: bool = False
-) -> Evaluation:
-    """:func:`safe_rl.evaluation.evaluate`, of a policy of the package on a copy.
-
-    Raises:
-        ValueError: If the options ask for a certificate or for variations.
-    """
-    from safe_rl.evaluation import evaluate
-    from safe_rl.evaluation.policies import writable_copy
-
-    directory = writable_copy(directory)
-    if options.certify or options.variations is not None:
-        raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
-    return evaluate(directory, options, progress=progress)
 
 
 def evaluate_varied(
     directory: Path, options: EvaluationOptions, *, progress: bool = False
 ) -> tuple[Varied, Path]:
     """Run a policy under ``options.variations``; return the results, and the path of a picture."""
-    from safe_rl.evaluation.policies import writable_copy
     from safe_rl.evaluation.variations import evaluate_variations
     from safe_rl.reporting.figures import draw_variations
 
-    directory = writable_copy(directory)
     varied = evaluate_variations(directory, options, progress=progress)
-    picture = Run(directory).evaluation_file(options.name, "png", "variations")
+    picture = varied.file.with_suffix(".png")
     draw_variations(varied.rows, varied.cost_limits, picture)
     return varied, picture
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
-    from safe_rl.evaluation.policies import writable_copy
     from safe_rl.training.finish import certify_run
 
     names = ("certify", "certificate", "deterministic", "num_threads")
@@ -85,7 +65,7 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
                 "deterministic=true and num_threads=…"
             )
     certificate = certify_run(
-        writable_copy(directory),
+        directory,
         num_threads=options.num_threads,
         changes=options.certificate,
         deterministic=options.deterministic,

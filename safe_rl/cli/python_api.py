@@ -28,9 +28,9 @@ from safe_rl.cli.composing import (
     refuse_changes,
 )
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.evaluate import evaluate_run, evaluate_varied
+from safe_rl.cli.evaluate import evaluate_varied
 from safe_rl.cli.options import make_options
-from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading
+from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading, measuring
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.variations import Varied
@@ -317,7 +317,7 @@ class Run(RecordedRun):
             ValueError: If there is no such option, or it cannot have the value.
         """
         given = {"checkpoint": self.checkpoint, **options}
-        return evaluate_run(self.directory, make_options(given, EvaluationOptions))
+        return measuring.evaluate(self.directory, make_options(given, EvaluationOptions))
 
     def certify(self, **changes: Any) -> Certificate | None:
         """Certify the best checkpoint that keeps the limits, as at the end of training.

@@ -22,6 +22,7 @@ from safe_rl.evaluation.loading import (
     maker_of,
     override_env,
 )
+from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
@@ -163,7 +164,7 @@ def evaluate(
     """Run a trained policy for whole episodes and write estimates into the run's folder.
 
     Args:
-        directory: Folder of a run.
+        directory: Folder of a run; a policy of the package is copied into the working directory.
         options: What to evaluate.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments
             from a run's ``env``; None: :func:`safe_rl.envs.make_env` with the run's own robot.
@@ -174,9 +175,13 @@ def evaluate(
         OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If an option is out of its range, or the environment cannot be drawn.
+        ValueError: If an option is out of its range, or asks for a certificate or for variations,
+            or the environment cannot be drawn.
     """
     check_options(options)
+    if options.certify or options.variations is not None:
+        raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
+    directory = writable_copy(directory)
     run = Run(directory)
     config = run.config
     checkpoint = run.find_checkpoint(options.checkpoint)

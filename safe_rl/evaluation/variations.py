@@ -17,6 +17,7 @@ from safe_rl.evaluation.measuring import (
     format_limits_without_cost,
     summarise,
 )
+from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
 from safe_rl.naming import did_you_mean
@@ -240,7 +241,7 @@ def evaluate_variations(
     all environments.
     """
     check_options(options)
-    variations = read_variations(options.variations)
+    variations, directory = read_variations(options.variations), writable_copy(directory)
     run, make_env = Run(directory), make_env or maker_of(directory)
     config = run.config
     config.env = override_env(config, options.env)

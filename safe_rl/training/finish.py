@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from safe_rl.evaluation import Certificate, certify
+from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import certificate_options
 from safe_rl.runs.folder import checkpoint_steps, lock_folder
 from safe_rl.runs.run import Run
@@ -28,7 +29,7 @@ def certify_run(
     """Certify the best checkpoint of a run that keeps its limits; no other process may write it.
 
     Args:
-        directory: Folder of the run.
+        directory: Folder of the run; a policy of the package is copied into the working directory.
         num_threads: Threads that step environments; 0 is one per core.
         changes: Keys of the section ``certificate`` to change.
         deterministic: Whether the policy acts with its mean actions.
@@ -40,7 +41,7 @@ def certify_run(
         RunInUseError: If another process writes into the folder.
         ValueError: If there is no such key, or it cannot have the value.
     """
-    run = Run(directory)
+    run = Run(writable_copy(Path(directory)))
     asked = {**(changes or {}), **({"deterministic": True} if deterministic else {})}
     options = certificate_options(run.config, asked)
     with lock_folder(run.lock_file):  # an unwritable folder is found before hours of tests

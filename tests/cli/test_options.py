@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from safe_rl.checks import SettingError
-from safe_rl.cli.evaluate import evaluate_run
 from safe_rl.cli.options import OptionError, make_options, read_options, run_command, usage
+from safe_rl.evaluation import evaluate
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -55,7 +55,7 @@ def test_errors_say_what_to_write(argument, message):
 def test_options_that_need_others_are_refused_before_anything_is_done(tmp_path):
     options = read_options(["camera=track"], EvaluationOptions)
     with pytest.raises(ValueError, match=r"camera=track: it is the video's: add video=true\."):
-        evaluate_run(tmp_path / "no run at all", options)
+        evaluate(tmp_path / "no run at all", options)
 
 
 def test_keywords_may_be_numbers_of_numpy_and_paths():

@@ -10,9 +10,9 @@ import yaml
 from evaluated_runs import NUM_STEPS, options
 from omegaconf import OmegaConf
 
-from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.cli.evaluate import main
 from safe_rl.envs import make_env
+from safe_rl.evaluation import evaluate
 
 
 def read_columns(path):

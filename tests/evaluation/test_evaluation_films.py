@@ -8,11 +8,10 @@ import torch
 from evaluated_runs import NUM_STEPS, options, skip_without_opengl
 from PIL import Image
 
-from safe_rl.cli.evaluate import evaluate_run as evaluate
 from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
 from safe_rl.envs.velocity import VelocityEnv
-from safe_rl.evaluation import measuring, video
+from safe_rl.evaluation import evaluate, measuring, video
 from safe_rl.evaluation.video import FORMATS, video_format
 
 pytestmark = pytest.mark.long

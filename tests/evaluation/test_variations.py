@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 import safe_rl
-from safe_rl.cli.evaluate import evaluate_run, main
-from safe_rl.evaluation import EvaluationOptions
+from safe_rl.cli.evaluate import main
+from safe_rl.evaluation import EvaluationOptions, evaluate
 from safe_rl.evaluation.variations import Variation, read_variations, varied
 from safe_rl.files import CONF, read_yaml
 
@@ -45,7 +45,7 @@ def test_every_row_is_the_evaluation_of_its_environment(run, capsys):
     keys = ({}, {"mass_scale": 0.5}, {"mass_scale": 2}, {"hazards_num": 12})
     for row, env in zip(found.values(), keys, strict=True):
         options = EvaluationOptions(episodes=6, num_envs=3, num_threads=1, env=env)
-        estimates = evaluate_run(run, options).estimates
+        estimates = evaluate(run, options).estimates
         for name, estimate in estimates.items():
             if not name.startswith("normalised"):
                 ends = [float(row[f"{name}{end}"]) for end in ("", "_low", "_high")]
@@ -102,7 +102,7 @@ def test_transforms_are_those_of_a_run_that_has_them(run, tmp_path):
         config.transforms[transform][key] = value
         OmegaConf.save(config, copy / "config.yaml")
         options = EvaluationOptions(episodes=6, num_envs=3, num_threads=1)
-        estimates = evaluate_run(copy, options).estimates
+        estimates = evaluate(copy, options).estimates
         assert float(found[row]["episode_return"]) == estimates["episode_return"].value
         assert found[row]["episode_return"] != found["as trained"]["episode_return"]
 

@@ -11,10 +11,9 @@ from point_mass import Forgetful, PointMass
 from run_configs import assert_resumes_exactly, off_policy_config, point_mass_config
 from torchrl.envs.transforms import StepCounter
 
-from safe_rl.cli import evaluate
-from safe_rl.cli.evaluate import evaluate_run
+from safe_rl.cli.evaluate import main as evaluate_main
 from safe_rl.envs.transforms import transform_env
-from safe_rl.evaluation import EvaluationOptions
+from safe_rl.evaluation import EvaluationOptions, evaluate
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
@@ -187,7 +186,7 @@ def test_the_command_line_runs_them(command, arguments):
     table = read_table(Path("run/progress.csv"))
     assert table["steps"] == [80, 160, 240]
     imports = [text for text in arguments if text.startswith("import=")]
-    assert not evaluate.main(["run", "episodes=4", "num_envs=2", *imports])
+    assert not evaluate_main(["run", "episodes=4", "num_envs=2", *imports])
     if imports:
         assert table["episode_cost_interventions"][-1] > 0
         assert any(
@@ -203,7 +202,7 @@ def test_an_evaluation_returns_the_reward_of_the_environment(command):
     unsafe += ["env.hazards_size=2.0", "env.hazards_keepout=0.0"]
     status, _, said = command(*RUN, "algo=ppo", "transforms=[saute]", *unsafe)
     assert not status, said
-    result = evaluate_run(Path("run"), EvaluationOptions(episodes=4, num_envs=2, num_threads=1))
+    result = evaluate(Path("run"), EvaluationOptions(episodes=4, num_envs=2, num_threads=1))
     assert result.estimates["episode_cost"].value > 0
     assert abs(read_table(Path("run/progress.csv"))["episode_return"][-1]) < 100
     assert abs(result.estimates["episode_return"].value) < 100
