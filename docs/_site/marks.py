@@ -41,13 +41,10 @@ def listed(kind: str) -> str:
 
 
 def columns(names: str) -> str:
-    """Rows of the tables of columns.md, named by `<!-- table: columns of … -->`."""
-    text = (PAGES / "columns.md").read_text() + "\n"
-    tables = [
-        re.search(rf"<!-- table: columns of {name} -->\n(.*?)\n\n", text, re.DOTALL)[1]  # type: ignore[index]
-        for name in names.split()
-    ]
-    rows = [row for table in tables for row in table.splitlines()[2:]]
+    """Rows of the tables of columns.md whose last cell has one of the groups."""
+    text = (PAGES / "columns.md").read_text()
+    found = re.findall(r"^(\| `.* \|) ([\w, ]+) \|$", text, re.M)
+    rows = [row for name in names.split() for row, groups in found if name in groups.split(", ")]
     head = "| column, besides [those of every run](columns.md#every-algorithm) | meaning |"
     return "\n".join([head, "|---|---|", *rows])
 

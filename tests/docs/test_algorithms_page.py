@@ -14,7 +14,8 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
 PAGE = (DOCS / "algorithms" / "index.md").read_text()
-COLUMNS_PAGE = (DOCS / "algorithms" / "columns.md").read_text() + "\n"
+# the table of every algorithm
+OF_ALL = (DOCS / "algorithms" / "columns.md").read_text().partition("## Costs and limits")[0]
 LIMITED = ["cost_hazards", "cost_north"]
 OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
 
@@ -24,16 +25,15 @@ def test_every_algorithm_is_in_the_lists():
     assert all(f"| [`{algo}`]({algo}.md) |" in lists for algo in ALGORITHMS)
 
 
-def rows(name):
-    """Cells of the table below its mark, without the heading."""
-    table = re.search(rf"<!-- table: {name} -->\n(.*?)\n\n", PAGE + COLUMNS_PAGE, re.DOTALL)[1]
-    return [re.split(r" ?\| ?", line)[1:-1] for line in table.splitlines()[2:]]
+def cells(table):
+    """Cells of a table's rows, without the heading."""
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    return [re.split(r" ?\| ?", line)[1:-1] for line in lines[2:]]
 
 
-def columns(names, costs):
-    """Names of the columns that tables explain, one per cost where they say so."""
-    cells = [first for name in names for first, *_ in rows(f"columns of {name}")]
-    found = [entry for cell in cells for entry in re.findall(r"`([^`]+)`", cell)]
+def columns(table, costs):
+    """Names of the columns that a table explains, one per cost where it says so."""
+    found = [entry for first, *_ in cells(table) for entry in re.findall(r"`([^`]+)`", first)]
     return {entry.replace("<cost>", cost) for entry in found for cost in costs}
 
 
@@ -50,7 +50,8 @@ def test_the_columns_are_those_of_a_run(algo, tmp_path):
         "cost_limits={cost_hazards: 1, cost_north: 1}",
         minibatch_size=None if "trpo" in columns_of(algo) else 40,
     )
-    documented = columns(["all"], PointMass.cost_keys) | columns(columns_of(algo), LIMITED)
+    documented = columns(OF_ALL, PointMass.cost_keys)
+    documented |= columns(marks.columns(" ".join(columns_of(algo))), LIMITED)
     assert columns_of_a_run(config, tmp_path) == documented
 
 
@@ -63,10 +64,10 @@ def test_the_columns_are_those_of_an_off_policy_run(algo, tmp_path):
         Recording(tmp_path / "data", env.cost_keys).write(0, env.rollout(20))
         keys += [f"dataset.path={tmp_path / 'data'}"]
     config = compose_config(*keys, "exploration.random_steps=80", *sizes)
-    documented = columns(["all"], PointMass.cost_keys)
+    documented = columns(OF_ALL, PointMass.cost_keys)
     # those of its table that begin so are of PPO
     documented = {name for name in documented if not name.startswith(("policy_", "critic_"))}
-    documented |= columns(columns_of(algo), ["cost"])
+    documented |= columns(marks.columns(" ".join(columns_of(algo))), ["cost"])
     assert columns_of_a_run(config, tmp_path) == documented
 
 
@@ -74,7 +75,7 @@ def test_the_columns_are_those_of_an_off_policy_run(algo, tmp_path):
 def test_the_numbers_of_the_paper_beside_the_defaults(folder):
     algorithms = ("ppo_lagrangian", "cpo")
     configs = [compose_config(f"algo={folder}{algo}", "env=PointMass") for algo in algorithms]
-    for key, default, paper, _ in rows("presets"):
+    for key, default, paper, _ in cells(PAGE.partition("## Presets")[2]):
         value = OmegaConf.create(f"value: {paper if folder else default}").value
         assert value in [OmegaConf.select(config, key.strip("`")) for config in configs], key
 
