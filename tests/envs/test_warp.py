@@ -197,10 +197,15 @@ def test_an_epoch_waits_for_the_device_once_for_every_step(algo, more_updates, t
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", ["PointGoal1", "CarButton2", "DoggoPush1"])
+@pytest.mark.parametrize(
+    "name",
+    ["PointGoal1", "CarButton2", "DoggoPush1", "SafeHopperVelocity", "SafeHumanoidVelocity"],
+)
 def test_steps_on_cuda_do_not_wait_and_are_those_of_the_cpu_device(name):
-    config = resolve(name).replace(physics="warp")
-    envs = [SafetyGymEnv(config, 16, device, seed=0) for device in ("cpu", "cuda")]
+    envs = [
+        make_env(name, num_envs=16, device=device, seed=0, physics="warp")
+        for device in ("cpu", "cuda")
+    ]
     states = [env.reset() for env in envs]
     for _ in range(3):
         envs[1].set_state(envs[0].get_state().to("cuda"))
