@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.config import General, keys_of, unknown_key
+from safe_rl.cli.options import first_line, unreadable
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.envs.safety_gym.config import KEYS
@@ -149,8 +150,7 @@ def _written(value: Any) -> str:
 def explain(error: Exception, words: Sequence[str]) -> str:
     """What is wrong with a command, in one line that names the nearest right word."""
     if isinstance(error, OverrideParseException):
-        text = getattr(error, "override", "")
-        return f"'{text}' cannot be read: {_first_line(error)}.{_hint_of_grammar(str(text))}"
+        return unreadable(str(error.override), error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _unknown_choice(error)
     unknown = re.match(r"Could not override '([^']+)'\.", str(error))
@@ -165,29 +165,11 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     if absent and absent[1] in General.__annotations__:
         return f"this algorithm has no '{absent[1]}'."
     if cause is not None and str(error) != str(cause):
-        return f"{_first_line(error)}: {_first_line(cause)}"
+        return f"{first_line(error)}: {first_line(cause)}"
     missing = re.match(r"Missing mandatory value: (\S+)", str(error))
     if missing:
         return f"{missing[1]} has to be given: {missing[1]}=…"
     return " ".join(str(error).split())
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def _hint_of_grammar(text: str) -> str:
-    """How to write what Hydra's grammar could not read."""
-    if "=" not in text:
-        return " A setting is written key=value, such as env=PointGoal1."
-    if re.search(r"\{\s*['\"]", text):
-        return " Names within braces have no quotes: '{cost: 10}'."
-    if text.count("{") != text.count("}"):
-        return " Put values with spaces in quotes: cost_limits='{cost: 10}'."
-    if re.search(r"[^\x20-\x7e]|[ \[\](){}$,]", text.partition("=")[2]):
-        key, _, value = text.partition("=")
-        return f" A text with such characters needs quotes within quotes: \"{key}='{value}'\"."
-    return ""
 
 
 def _unknown_choice(error: MissingConfigException) -> str:

@@ -7,6 +7,7 @@ dataclass: pydantic checks them by their annotations, and their help texts make 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import warnings
@@ -102,8 +103,31 @@ def _value(word: str) -> Any:
     try:
         return OverridesParser.create().parse_override(word).value()
     except HydraException as error:
-        hint = " Put values with spaces in quotes: cost_limits='{cost: 10}'." if "{" in word else ""
-        raise OptionError(f"'{word}' cannot be read: {str(error).splitlines()[0]}.{hint}") from None
+        raise OptionError(unreadable(word, error)) from None
+
+
+def unreadable(word: str, error: Exception) -> str:
+    """A message that Hydra's grammar cannot read a word, and how to write it."""
+    return f"'{word}' cannot be read: {first_line(error)}.{_hint_of_grammar(word)}"
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of an error's message, or the name of its class."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
+def _hint_of_grammar(text: str) -> str:
+    """How to write what Hydra's grammar could not read."""
+    if "=" not in text:
+        return " A setting is written key=value, such as env=PointGoal1."
+    if re.search(r"\{\s*['\"]", text):
+        return " Names within braces have no quotes: '{cost: 10}'."
+    if text.count("{") != text.count("}"):
+        return " Put values with spaces in quotes: cost_limits='{cost: 10}'."
+    if re.search(r"[^\x20-\x7e]|[ \[\](){}$,]", text.partition("=")[2]):
+        key, _, value = text.partition("=")
+        return f" A text with such characters needs quotes within quotes: \"{key}='{value}'\"."
+    return ""
 
 
 def _plain(value: Any) -> Any:
