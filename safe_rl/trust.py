@@ -190,7 +190,8 @@ def _in_words(error: BaseException, key: str, target: Callable[..., Any]) -> Set
         close = did_you_mean(unknown[1], parameters_of(target))
         name = join_keys(key, unknown[1])
         return SettingError(f"{name}: {target.__name__} has no such argument.{close}")
-    return SettingError(f"{key}: {error}" if key else str(error))
+    words = " ".join(str(error).split())
+    return SettingError(f"{key}: {words}" if key else words)
 
 
 def locate(target: Any, key: str = "") -> Callable[..., Any]:
