@@ -15,7 +15,7 @@ from hydra.core.utils import JobReturn
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from safe_rl.cli.sweeps import Summary, run_in_sweep
+from safe_rl.cli.train import Summary, run_in_sweep
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import final_figures, read_table
@@ -56,8 +56,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         run_in_sweep(made, config.hydra, directory)
         summary.on_job_end(config, JobReturn())
 
-    monkeypatch.setattr("safe_rl.cli.sweeps.run_job", run_job)
-    monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
+    monkeypatch.setattr("safe_rl.cli.train.run_job", run_job)
+    monkeypatch.setattr("safe_rl.cli.train.check_settings", lambda config: None)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")
     carry_out(0)
