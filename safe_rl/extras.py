@@ -57,7 +57,7 @@ def hint_of_plugin(choice: str) -> str:
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """Import a module that comes with one of the extras, after :func:`require_extra`."""
+    """Import a module that comes with one of the extras, after `require_extra`."""
     require_extra(module, extra)
     return import_module(module)
 

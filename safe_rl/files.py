@@ -190,25 +190,25 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file by :func:`replacing`."""
+    """Write a text file by `replacing`."""
     with replacing(path) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
 
 
 def replace_json(path: Path, content: Any) -> None:
-    """Write a JSON file by :func:`replacing`; numbers that are not finite become null."""
+    """Write a JSON file by `replacing`; numbers that are not finite become null."""
     plain = json.loads(json.dumps(content, default=dict), parse_constant=lambda _: None)
     replace_text(path, json.dumps(plain, indent=2, ensure_ascii=False) + "\n")
 
 
 def replace_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
-    """Write a CSV file by :func:`replacing`; the first row is the header."""
+    """Write a CSV file by `replacing`; the first row is the header."""
     with replacing(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
-    """Write tensors, numbers, texts and plain containers by `torch.save` and :func:`replacing`."""
+    """Write tensors, numbers, texts and plain containers by `torch.save` and `replacing`."""
     import torch  # imported here: help and configurations are shown without torch
 
     try:
@@ -220,7 +220,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def load_tensors(path: Path, *, lazy: bool = False) -> Any:
-    """Read a file of :func:`save_tensors`, also of another person; no code in it is run.
+    """Read a file of `save_tensors`, also of another person; no code in it is run.
 
     Args:
         path: The file.

@@ -38,7 +38,7 @@ class Resumable:
         return {name: _saved(getattr(self, name)) for name in self.state_names}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Restore what :meth:`state_dict` has returned.
+        """Restore what `state_dict` has returned.
 
         Raises:
             ValueError: If a value is missing, or of another kind or shape than the attribute.

@@ -137,7 +137,7 @@ def instantiate(
     optional: Mapping[str, Any] | None = None,
     **objects: Any,
 ) -> Any:
-    """Build what a node's ``_target_`` names, as :func:`hydra.utils.instantiate` does.
+    """Build what a node's ``_target_`` names, as `hydra.utils.instantiate` does.
 
     Args:
         node: The node. Nodes within it that have a ``_target_`` are built first. A node with

@@ -34,7 +34,7 @@ class Stateful(Protocol):
         ...
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any:
-        """Continue from :meth:`state_dict`."""
+        """Continue from `state_dict`."""
         ...
 
 

@@ -219,7 +219,7 @@ class Constraints(Resumable):
         return {"tracker": self.tracker.state_dict()} | risk
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
+        """Continue from `state_dict`."""
         if self.tracker is None:
             self._finished = state_dict["finished"].to(self._finished)
             self._mean_length = state_dict["mean_length"].to(self._mean_length)

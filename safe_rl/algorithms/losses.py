@@ -142,7 +142,7 @@ class LossState:
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Load a :meth:`state_dict` in place, because an optimiser has the same tensors."""
+        """Load a `state_dict` in place, because an optimiser has the same tensors."""
         for name, tensor in self.tensors.items():
             tensor.copy_(state_dict[name])
 

@@ -1,7 +1,7 @@
 """Gradient updates: passes over one batch in minibatches, and their learning rate.
 
 The same class trains policies (PPO) and critics. Policy updates of another kind, such as
-trust-region steps, are also a :class:`~safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
+trust-region steps, are also a `safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
 """
 
 from __future__ import annotations

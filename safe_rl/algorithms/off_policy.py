@@ -208,7 +208,7 @@ class OffPolicy(Resumable, Algorithm):
         self.policy.is_random.fill_(self.steps < self.random_steps)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
+        """Continue from `state_dict`."""
         super().load_state_dict(state_dict)
         self._count_steps(0)
 

@@ -186,7 +186,7 @@ class Memory(Checked):
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`.
+        """Continue from `state_dict`.
 
         Raises:
             ValueError: If entries are missing, or have other shapes or types than the example's.

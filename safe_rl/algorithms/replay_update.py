@@ -207,7 +207,7 @@ class ReplayUpdate(Checked):
 
     @torch.no_grad()
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from :meth:`state_dict`."""
+        """Continue from `state_dict`."""
         stored = dict(state_dict["optimizer"])
         # the saved run may have used another device
         stored["param_groups"] = [

@@ -81,7 +81,7 @@ def train(
         ValueError: If a setting is invalid; the message names it.
         FileExistsError: If the folder holds a run.
         KeyboardInterrupt: After Ctrl-C, once the current epoch has its checkpoint, from which
-            :func:`resume` continues.
+            `resume` continues.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -120,15 +120,15 @@ def resume(
 
     Args:
         directory: Folder of the run.
-        imports: Modules that the run needs, as in :func:`load`.
-        callbacks: As in :func:`train`.
+        imports: Modules that the run needs, as in `load`.
+        callbacks: As in `train`.
         settings: Keys to change from now on, such as ``frames=500_000`` or
             ``policy_update={"max_kl": 0.01}``.
 
     Raises:
         ValueError: If the folder holds no run, the run has used modules and ``imports`` is None,
             or a setting cannot change; the message names it.
-        KeyboardInterrupt: As in :func:`train`.
+        KeyboardInterrupt: As in `train`.
 
     Examples:
         >>> small = {"num_envs": 2, "frames_per_batch": 40, "env.num_steps": 20, "logger": "none"}
@@ -167,7 +167,7 @@ def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
 
     Args:
         run: The run, or its folder.
-        options: Those of :meth:`Run.evaluate`.
+        options: Those of `Run.evaluate`.
 
     Examples:
         >>> print(evaluate(getfixture("tiny_run"), episodes=2))  # doctest: +ELLIPSIS
@@ -249,7 +249,7 @@ class Run(RecordedRun):
 
     @cached_property
     def policy(self) -> TensorDictModuleBase:
-        """Its trained policy; :func:`torchrl.envs.set_exploration_type` selects mean or sample.
+        """Its trained policy; `torchrl.envs.set_exploration_type` selects mean or sample.
 
         After training with ``transforms=[action_repeat]`` it is a `HeldActions`, which also acts
         step by step in an environment without this transform.
@@ -310,7 +310,7 @@ class Run(RecordedRun):
         """Run the policy for whole episodes; write the command's files into the folder.
 
         Args:
-            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`, such as
+            options: Those of `safe_rl.evaluation.EvaluationOptions`, such as
                 ``episodes=100``; keys of the environment as ``env={"hazards_num": 12}``.
 
         Raises:
@@ -340,7 +340,7 @@ class Run(RecordedRun):
         Args:
             variations: As the command's ``variations=``: ``"dynamics"``, or custom rows,
                 ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
-            options: Those of :class:`safe_rl.evaluation.EvaluationOptions`.
+            options: Those of `safe_rl.evaluation.EvaluationOptions`.
         """
         given = {"checkpoint": self.checkpoint, "variations": variations, **options}
         return evaluate_varied(self.directory, make_options(given, EvaluationOptions))[0]

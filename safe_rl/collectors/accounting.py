@@ -153,11 +153,11 @@ class EpisodeAccounting(Resumable):
             ``steps_taken`` below ``"next"`` has the number of each time step.
 
     Raises:
-        KeyError: By :meth:`update`, if a key is not in the batch.
-        EpisodeError: By :meth:`update`, if a cost is below 0, or an episode too long.
-        FloatingPointError: By :meth:`update`, if an observation, action, reward or cost is NaN or
+        KeyError: By `update`, if a key is not in the batch.
+        EpisodeError: By `update`, if a cost is below 0, or an episode too long.
+        FloatingPointError: By `update`, if an observation, action, reward or cost is NaN or
             infinite.
-        ValueError: By :meth:`update`, if the batch does not have the shape [N, T], or [T] with
+        ValueError: By `update`, if the batch does not have the shape [N, T], or [T] with
             N = 1, or an entry is not one number per step.
 
     Examples:

@@ -45,7 +45,7 @@ def starting_processes() -> Iterator[None]:
 
     These signals reach all processes of a run: by Ctrl-C, by the end of a terminal, or from the
     scheduler of a cluster. Only the first process should react to them, but they would end the
-    others while these start. The others block them until :func:`leave_signals_to_parent`.
+    others while these start. The others block them until `leave_signals_to_parent`.
     """
     # started later, together with the first process, the tracker would unblock the signals
     resource_tracker.ensure_running()
@@ -62,7 +62,7 @@ def leave_signals_to_parent() -> None:
     """Let this process end when its parent ends or sends SIGTERM, and ignore other signals.
 
     The other signals are SIGINT, SIGHUP, and SIGTERM from any other process. Call this function in
-    the main thread of a process that was started within :func:`starting_processes`. Where the
+    the main thread of a process that was started within `starting_processes`. Where the
     system does not tell the sender of a signal (macOS), any SIGTERM ends the process.
     """
     for number in (signal.SIGINT, signal.SIGHUP):

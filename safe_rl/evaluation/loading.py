@@ -101,7 +101,7 @@ def node_of(run: Run, config: DictConfig) -> dict[str, Any]:
 
 
 def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:
-    """:func:`safe_rl.make_env` for a run's environments, with the robot that it began with."""
+    """`safe_rl.make_env` for a run's environments, with the robot that it began with."""
     run = Run(directory)
     return lambda env, **options: make_env(robot_of(run, env), **options)
 

@@ -37,7 +37,7 @@ class Evaluation:
 
     Attributes:
         facts: What was evaluated, and how: JSON-compatible.
-        estimates: Name -> estimate, see :func:`safe_rl.evaluation.summarise`.
+        estimates: Name -> estimate, see `safe_rl.evaluation.summarise`.
         files: What was written.
     """
 
@@ -167,7 +167,7 @@ def evaluate(
         directory: Folder of a run; a policy of the package is copied into the working directory.
         options: What to evaluate.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments
-            from a run's ``env``; None: :func:`safe_rl.envs.make_env` with the run's own robot.
+            from a run's ``env``; None: `safe_rl.envs.make_env` with the run's own robot.
         progress: Whether to show a bar.
 
     Raises:

@@ -174,7 +174,7 @@ class VariedRow(NamedTuple):
 
     Attributes:
         variation: The variation; `AS_TRAINED` if nothing was changed.
-        estimates: Name -> estimate, see :func:`safe_rl.evaluation.summarise`.
+        estimates: Name -> estimate, see `safe_rl.evaluation.summarise`.
     """
 
     variation: Variation
@@ -237,7 +237,7 @@ def evaluate_variations(
     """Run a trained policy in its own environment and under ``options.variations``.
 
     All environments have the same seed, so that differences between them are less due to chance.
-    Arguments and errors are those of :func:`safe_rl.evaluation.evaluate`; ``options.env`` changes
+    Arguments and errors are those of `safe_rl.evaluation.evaluate`; ``options.env`` changes
     all environments.
     """
     check_options(options)

@@ -49,7 +49,7 @@ _FRAME = 0.04  # simulated time from one frame of an MP4 to the next [s]
 
 
 def video_format(env: EnvBase, suffix: str) -> VideoFormat:
-    """Format of the recording of an environment's episode, for a suffix in :data:`FORMATS`.
+    """Format of the recording of an environment's episode, for a suffix in `FORMATS`.
 
     An MP4 plays in real time, if the environment has ``seconds_per_step``.
     """

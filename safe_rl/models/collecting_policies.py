@@ -37,7 +37,7 @@ class BehaviourPolicy(TensorDictModuleBase):
     ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN``, the action is ``loc``.
 
     Args:
-        actor: Policy made by :func:`make_actor`, or by `assemble_actor` with the head "gaussian".
+        actor: Policy made by `make_actor`, or by `assemble_actor` with the head "gaussian".
 
     Examples:
         >>> import torch
@@ -78,8 +78,8 @@ class ExploringPolicy(TensorDictModuleBase):
     the action is that of the deterministic actor, or the tanh of the Gaussian's mean.
 
     Args:
-        actor: A policy made by :func:`~safe_rl.models.make_squashed_actor` or
-            :func:`~safe_rl.models.make_bounded_actor`.
+        actor: A policy made by `safe_rl.models.make_squashed_actor` or
+            `safe_rl.models.make_bounded_actor`.
         low: Lower bounds of the action, [A].
         high: Upper bounds of the action, [A].
         noise: Standard deviation of the noise of a deterministic actor, as a fraction of half the

@@ -67,7 +67,7 @@ class RunningScale(nn.Module):
     """Subtract a running mean, divide by a running standard deviation, and clip at ±``clip``.
 
     The moments are buffers in double precision: a checkpoint contains them with the weights, so a
-    resumed run has the same results. Only :meth:`update` changes them. Training calls it once per
+    resumed run has the same results. Only `update` changes them. Training calls it once per
     batch, after learning from the batch, so that the log-probabilities of a batch stay those of the
     policy that collected it. Before the first update, inputs are only clipped.
 

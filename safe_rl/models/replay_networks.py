@@ -100,7 +100,7 @@ def make_bounded_actor(
 ) -> TensorDictModule:
     """Build a deterministic policy whose actions are the tanh of a network, within bounds (TD3's).
 
-    Arguments are those of :func:`make_squashed_actor`.
+    Arguments are those of `make_squashed_actor`.
 
     Examples:
         >>> from tensordict import TensorDict

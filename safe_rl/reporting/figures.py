@@ -132,7 +132,7 @@ def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
 def draw_fronts(
     groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style], width: float = WIDTH
 ) -> Figure:
-    """Draw final returns against final costs, a panel per group of :func:`compared`.
+    """Draw final returns against final costs, a panel per group of `compared`.
 
     A point is an experiment, with the standard deviations over its seeds. A line in an algorithm's
     colour joins its experiments under several limits; the limits are written beside the points.

@@ -155,7 +155,7 @@ def lock_folder(file: Path) -> Iterator[None]:
 
 
 def is_unfinished(path: Path) -> bool:
-    """Whether a file is one that :func:`safe_rl.files.replacing` has not finished to write."""
+    """Whether a file is one that `safe_rl.files.replacing` has not finished to write."""
     return _UNFINISHED.fullmatch(path.name) is not None and path.is_file()
 
 

@@ -121,7 +121,7 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
 
     Runs for which these are equal differ only in the seed, and in where and how they were run.
     ``init_from`` is reduced to the part that all seeds share, see
-    :func:`safe_rl.runs.folder.common_source`.
+    `safe_rl.runs.folder.common_source`.
 
     Args:
         config: Configuration of a run, resolved.

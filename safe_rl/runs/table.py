@@ -43,7 +43,7 @@ class TableWriter(AbstractContextManager["TableWriter"]):
 
     Raises:
         TableError: If there are fewer rows than are to be kept, or one cannot be read; from
-            :meth:`write`, if a row's columns differ from those of the first row.
+            `write`, if a row's columns differ from those of the first row.
 
     Examples:
         >>> import tempfile
@@ -264,7 +264,7 @@ def final_figures(
 ) -> dict[str, float]:
     """Final J_r, J_c and ρ_c (Ray et al. 2019, section 5.1), and steps per second of the run.
 
-    J_r, J_c and violations of limits are means over the last :func:`final_width` epochs in which an
+    J_r, J_c and violations of limits are means over the last `final_width` epochs in which an
     episode finished; ρ_c is that of the last epoch.
     """
     costs = [f"{kind}_{key}" for key in cost_keys for kind in ("episode", "violation")]

@@ -248,7 +248,7 @@ def note_code(path: Path, steps: int) -> None:
 
     Args:
         path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
-            ``changed``; see :func:`code_of`.
+            ``changed``; see `code_of`.
         steps: Environment steps that the run has made.
     """
     try:

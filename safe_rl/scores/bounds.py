@@ -68,7 +68,7 @@ def best_growth(values: ArrayLike, mean: float, highest: float) -> float:
 def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     """Upper confidence bound of the mean of values in [0, ``highest``], for any distribution.
 
-    It is the largest mean that :func:`log_wealth` does not exclude. The bounds after 1, 2, … values
+    It is the largest mean that `log_wealth` does not exclude. The bounds after 1, 2, … values
     hold simultaneously: one may stop as soon as a bound is low enough.
 
     Args:

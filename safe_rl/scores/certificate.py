@@ -251,7 +251,7 @@ def first_certified(
     probably fail. Student's bound may be computed only once, after all episodes.
 
     Args:
-        order: Numbers of the candidates, from :func:`rank`.
+        order: Numbers of the candidates, from `rank`.
         collect: Costs of a candidate's fresh episodes, batch by batch.
         claims: Claim about each candidate.
         tests: Largest number of candidates tested; they share the error.
