@@ -190,6 +190,9 @@ _STORE.store(group="model", name="mlp", node={"encoders": None, "memory": None})
 
 _PARTS = ("critic_update", "memory", "limits", "lagrangian", "advantage", "cost_advantage", "actor")
 
+_NEEDED = ("loss", "policy_update", "critic_update", "advantage", "actor", "memory", "critics")
+"""Parts that the algorithms which have them cannot do without."""
+
 
 def check_settings(config: DictConfig) -> None:
     """Check a composed configuration, before anything is built.
@@ -245,10 +248,10 @@ def _check_parts(config: DictConfig) -> None:
         warnings.warn(
             f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
         )
-    for name in ("loss", "policy_update"):
+    for name in _NEEDED:
         part = config.get(name, "absent")
         if part is None or (OmegaConf.is_dict(part) and part.get("_target_", "") is None):
-            raise SettingError(f"{name}._target_=null: algo={config.algo.name} needs its {name}.")
+            raise SettingError(f"{name}=null: the {name} of an algorithm cannot be left out.")
     for name in _PARTS:
         part = config.get(name)
         if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):

@@ -56,7 +56,7 @@ def train(
     config: DictConfig,
     directory: Path | str,
     *,
-    hydra: DictConfig | None = None,
+    hydra: Any = None,
     continues: bool = False,
     callbacks: Sequence[Callback] = (),
     program: str | None = PROGRAM,
@@ -230,7 +230,7 @@ def _prepare(
     return trainer
 
 
-def _write_notes(run: Run, config: DictConfig, hydra: DictConfig) -> None:
+def _write_notes(run: Run, config: DictConfig, hydra: Any) -> None:
     """Write Hydra's notes; Hydra itself would write them before the run is known to begin."""
     run.notes_folder.mkdir(exist_ok=True)
     notes = (

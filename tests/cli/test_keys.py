@@ -99,7 +99,7 @@ def test_no_value_ends_in_a_traceback():
         ("frames", 2.5, "frames=2.5: it must be a valid integer"),
         ("num_envs", 0, "num_envs=0: it must be greater than or equal to 1"),
         ("model.memory", "a\nb", "model.memory must have the keys size"),
-        ("loss", None, "loss._target_=null: algo="),
+        ("loss", None, "loss=null: the loss of an algorithm"),
         ("limits.free_steps", [], "limits.free_steps=[]: it must be"),
         ("seed", True, "Value 'True' of type 'bool' could not be converted to Integer"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be less than or equal to 1"),
