@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import field
 from functools import cache, wraps
 from inspect import Parameter, Signature, isclass, signature
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from annotated_types import Interval
 from omegaconf import OmegaConf
@@ -90,6 +90,14 @@ def check_value(name: str, annotation: Any, value: Any) -> Any:
             return check_value(name, check, int(value))
         raise SettingError(f"{name}={_shown(value)}: {_words(error)}.") from None
     return value
+
+
+class CheckedOptions:
+    """Base of dataclasses whose fields are checked, by their annotations, when one is made."""
+
+    def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self), include_extras=True).items():
+            setattr(self, name, check_value(name, kind, getattr(self, name)))
 
 
 def adapter(annotation: Any) -> TypeAdapter[Any]:

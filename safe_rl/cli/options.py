@@ -33,7 +33,6 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from safe_rl.checks import check_value
 from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
@@ -88,7 +87,7 @@ def make_options(
         OmegaConf.update(read, key, _plain(value), force_add=True)
     settings = OmegaConf.to_container(read)
     assert isinstance(settings, dict)
-    return schema(**{str(k): check_value(str(k), kinds[str(k)], v) for k, v in settings.items()})
+    return schema(**{str(key): value for key, value in settings.items()})
 
 
 def _is_text(kind: Any) -> bool:

@@ -11,7 +11,15 @@ from annotated_types import Interval
 from omegaconf import DictConfig, OmegaConf
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from safe_rl.checks import Fraction, SettingError, Share, check_value, option, rule
+from safe_rl.checks import (
+    CheckedOptions,
+    Fraction,
+    SettingError,
+    Share,
+    check_value,
+    option,
+    rule,
+)
 from safe_rl.files import CONF
 from safe_rl.naming import did_you_mean
 
@@ -40,7 +48,7 @@ _NAME = rule(lambda v: "/" not in v and v.isprintable(), "a part of files' names
 
 
 @dataclass
-class EvaluationOptions:
+class EvaluationOptions(CheckedOptions):
     """Options of ``safe-rl evaluate``; the help texts say what they mean."""
 
     episodes: Annotated[int, Interval(ge=1, le=10**8)] = option(100, "whole episodes to run")
@@ -114,13 +122,11 @@ class CertificateOptions:
 
 
 def check_options(options: EvaluationOptions) -> None:
-    """Refuse options that cannot be used, before any work begins.
+    """Refuse options that cannot be used together, before any work begins.
 
     Raises:
-        ValueError: If an option is out of its range, or needs another one; the message names it.
+        ValueError: If an option needs another one, or excludes it; the message names it.
     """
-    for name, kind in get_type_hints(EvaluationOptions, include_extras=True).items():
-        check_value(name, kind, getattr(options, name))
     if options.certificate and not options.certify:
         raise ValueError("certificate.…: it is the certificate's: add certify=true.")
     films = options.video or options.picture

@@ -18,7 +18,7 @@ from annotated_types import Interval
 from matplotlib.figure import Figure
 from pydantic import PositiveInt
 
-from safe_rl.checks import option, rule
+from safe_rl.checks import CheckedOptions, option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 from safe_rl.reporting import figures, scoring, slates
@@ -48,7 +48,7 @@ _FORMATS = rule(
 
 
 @dataclass
-class ReportOptions:
+class ReportOptions(CheckedOptions):
     """Options of ``safe-rl report``; their help texts describe them."""
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")

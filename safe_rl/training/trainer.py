@@ -19,8 +19,8 @@ from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.writing import RunWriter
+from safe_rl.training.checkpoint_selection import CheckpointSelection
 from safe_rl.training.state import (
-    CheckpointSelection,
     EnvSnapshot,
     Progress,
     RandomGenerators,

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from safe_rl.runs.table import keeps
-from safe_rl.training.state import CheckpointSelection
+from safe_rl.training.checkpoint_selection import CheckpointSelection
 
 EPISODE = 1000
 

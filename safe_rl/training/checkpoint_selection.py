@@ -1,0 +1,122 @@
+"""Selection of the best checkpoints: each policy is evaluated by its own episodes."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from safe_rl.algorithms.algorithm_contract import Stateful, states_of
+from safe_rl.resumable import Resumable
+from safe_rl.runs.table import feasible_return
+
+# most epochs to wait: waiting policies are in main memory and in every checkpoint
+_LONGEST = 10
+
+
+def epochs_until_evaluated(over: int, length: float, steps_per_epoch: float) -> int:
+    """Epochs from a policy's update until the finished episodes are, on average, its own.
+
+    A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
+    began before it. Those that end half an episode length after the batch are centred on it.
+    Returns and costs are averaged over a number of epochs, `over`.
+
+    Examples:
+        >>> epochs_until_evaluated(over=1, length=1000, steps_per_epoch=1000)
+        1
+        >>> epochs_until_evaluated(over=3, length=1000, steps_per_epoch=200)
+        4
+    """
+    lag = length / steps_per_epoch / 2 if length > steps_per_epoch else 0.0
+    return 1 + min(_LONGEST, int(lag) + over // 2)
+
+
+class CheckpointSelection(Resumable):
+    """Policies that wait for the epochs in which their own episodes end.
+
+    Args:
+        components: Parts of the run, by name, that a checkpoint of a policy has.
+        limits: Cost key -> d, undiscounted cost per episode.
+        over: Number of epochs over which returns and costs are averaged.
+        steps_per_epoch: Steps of an environment in an epoch.
+        longest: Largest length of an episode, used as the mean length until an episode has ended.
+
+    Attributes:
+        waiting: The policies: ``steps`` and ``epoch`` of the run then, and ``states`` by name.
+    """
+
+    state_names = ("waiting",)
+
+    def __init__(
+        self,
+        components: Mapping[str, Stateful],
+        limits: Mapping[str, float],
+        *,
+        over: int,
+        steps_per_epoch: float,
+        longest: float,
+    ) -> None:
+        self._components, self._limits = dict(components), dict(limits)
+        self._over, self._steps_per_epoch, self._length = over, steps_per_epoch, float(longest)
+        self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
+        self.waiting: list[dict[str, Any]] = []
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the waiting policies.
+
+        Raises:
+            ValueError: If one lacks its steps, its epoch or its states.
+        """
+        super().load_state_dict(state_dict)
+        kinds = {"steps": int, "epoch": int, "states": dict}
+        for policy in self.waiting:
+            if not isinstance(policy, dict) or {k: type(v) for k, v in policy.items()} != kinds:
+                raise ValueError(
+                    "a waiting policy must have whole 'steps' and 'epoch', and 'states'."
+                )
+
+    def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
+        """Add the epochs of a run that is resumed."""
+        for row in rows:
+            self._take(row)
+
+    def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
+        """Add an epoch, and evaluate the waiting policy whose epochs are complete.
+
+        Args:
+            row: Of the run's table, by column.
+
+        Returns:
+            Keyword arguments of `CheckpointStore.save_best` for the policy, if it kept every limit.
+            If episodes have become shorter, several are due, and only the latest is evaluated.
+        """
+        self._take(row)
+        states = copy.deepcopy(states_of(self._components))
+        self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
+        delay = epochs_until_evaluated(self._over, self._length, self._steps_per_epoch)
+        due = len(self.waiting) - delay
+        passed = [self.waiting.pop(0) for _ in range(due)]
+        return self._evaluate(passed[-1]) if passed else []
+
+    def _take(self, row: Mapping[str, float]) -> None:
+        self._latest.append(row)
+        length = row.get("episode_length", math.nan)
+        self._length = length if math.isfinite(length) else self._length
+
+    def evaluate_all(self) -> list[dict[str, Any]]:
+        """Evaluate all waiting policies by the epochs so far, at the end of a run.
+
+        They keep waiting, because a resumed run has later epochs to evaluate them by.
+        """
+        return [evaluated for policy in self.waiting for evaluated in self._evaluate(policy)]
+
+    def _evaluate(self, policy: Mapping[str, Any]) -> list[dict[str, Any]]:
+        score = feasible_return(self._latest, self._limits)
+        if score is None:
+            return []
+        facts = {"epoch": policy["epoch"]}
+        return [
+            {"steps": policy["steps"], "score": score, "facts": facts, "states": policy["states"]}
+        ]
