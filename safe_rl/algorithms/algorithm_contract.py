@@ -75,7 +75,8 @@ class Algorithm(ABC):
     A configuration names the class as ``algo._target_``.
 
     Attributes:
-        cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm.
+        cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm, which says
+            ``algo.constrained: false``, or else its runs are certified.
         policy: Exploring policy, for the collector; it shares the networks' parameters.
         networks: Trained networks, by name. Another run can start from them.
         cost_networks: Names of the networks of the constrained costs. A run starts from another

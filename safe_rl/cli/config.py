@@ -248,7 +248,8 @@ def _check_parts(config: DictConfig) -> None:
         warnings.warn(
             f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
         )
-    for name in _NEEDED:
+    is_of_package = str(config.algo.get("_target_")).startswith("safe_rl.")
+    for name in _NEEDED if is_of_package else ():
         part = config.get(name, "absent")
         if part is None or (OmegaConf.is_dict(part) and part.get("_target_", "") is None):
             raise SettingError(f"{name}=null: the {name} of an algorithm cannot be left out.")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from safe_rl.checks import option
+from safe_rl.checks import CheckedOptions, option
 from safe_rl.cli.options import OptionError, run_command
 from safe_rl.trust import check_imports, import_modules
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class ExportOptions:
+class ExportOptions(CheckedOptions):
     """Options of ``safe-rl export``."""
 
     checkpoint: str = option(

@@ -28,8 +28,8 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     Raises:
         FileNotFoundError: If there is no run.
         OSError: If the page cannot be written; this is checked before any run is read.
-        ValueError: If an option cannot have its value; if RUNS_DIR/report is a link, because
-            another person could have chosen what it overwrites.
+        ValueError: If RUNS_DIR/report is a link, because another person could have chosen what it
+            overwrites.
     """
     out = root / "report" if options.out is None else Path(options.out).expanduser()
     if options.out is None and out.is_symlink():

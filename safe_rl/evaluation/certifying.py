@@ -17,6 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from safe_rl.checks import is_number
 from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.loading import maker_of
@@ -114,6 +115,9 @@ def certify(
 def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) -> tuple[int, float]:
     """Number and error probability of a test of a run; both are noted before its first episode."""
     tests = read_json(run.tests_file) if run.tests_file.is_file() else []
+    is_list = isinstance(tests, list) and all(isinstance(former, dict) for former in tests)
+    if not is_list or not all(is_number(former.get("error")) for former in tests):
+        raise ValueError(f"{run.tests_file} is not as a run writes it: restore it.")
     asked: dict[str, Any] = {"options": asdict(options), "limits": run.cost_limits}
     asked["candidates"] = [path.name for path in candidates]
     for number, former in enumerate(tests, 1):

@@ -50,12 +50,14 @@ def find_run(name: str | Path) -> Path:
     return POLICIES / path.name
 
 
-def writable_copy(directory: Path) -> Path:
+def writable_copy(directory: Path | str) -> Path:
     """The folder itself, or, if it is part of the package, a copy in the working directory."""
+    directory = Path(directory)
     if directory.parent != POLICIES:
         return directory
     copy = Path(_PREFIX, directory.name)
-    shutil.copytree(directory, copy, dirs_exist_ok=True)
+    if not Run(copy).is_run:  # an earlier copy may have results and certificates of the user's own
+        shutil.copytree(directory, copy, dirs_exist_ok=True)
     return copy
 
 

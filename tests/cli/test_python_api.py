@@ -141,8 +141,9 @@ def test_errors_name_the_setting(settings, message, tmp_path):
 
 def test_a_folder_is_named_by_directory_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for settings in ({"directory": ""}, {"hydra.run.dir": "mine"}):
-        with pytest.raises(ValueError, match="directory=… names the folder of the run"):
+    given = ("hydra.run.dir", "mine"), ("++hydra.run.dir", "mine"), ("hydra", {"run": {"dir": ""}})
+    for settings in ({"directory": ""}, *({key: value} for key, value in given)):
+        with pytest.raises(ValueError, match="names the folder of the run"):
             safe_rl.train(**settings)
     assert list(tmp_path.iterdir()) == []
 

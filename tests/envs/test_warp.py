@@ -300,3 +300,11 @@ def test_what_warp_lacks_is_refused(tmp_path):
         SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")
     with pytest.raises(ConfigError, match="physics=jax: it must be 'cpu' or 'warp'"):
         SafetyGymEnv({"physics": "jax"})
+
+
+def test_a_class_of_ones_own_may_have_another_constructor():
+    class Own(SafetyGymEnv):
+        def __init__(self, number):
+            super().__init__(resolve("PointGoal0").replace(physics="warp"), number)
+
+    assert Own(2).reset()["observation"].shape[0] == 2

@@ -121,6 +121,9 @@ def test_tests_of_a_run_spend_its_error_once_each(train):
     strict = replace(OPTIONS, level=0.99)
     with pytest.raises(ValueError, match=r"have spent an error of 0\.0492"):
         certify(directory, strict, make_env=make_env)
+    (directory / "certificate_tests.json").write_text('[{"level": 0.95}]')
+    with pytest.raises(ValueError, match=r"certificate_tests\.json is not as a run writes it"):
+        certify(directory, strict, make_env=make_env)
 
 
 def test_the_mean_beside_a_bound_is_of_episodes_that_did_not_end_the_test(train, monkeypatch):

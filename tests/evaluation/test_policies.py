@@ -18,7 +18,8 @@ from torchrl.envs.libs.gym import default_info_dict_reader
 import safe_rl
 from safe_rl.cli.evaluate import main as evaluate
 from safe_rl.cli.export import main as export
-from safe_rl.evaluation import policies
+from safe_rl.evaluation import EvaluationOptions, policies
+from safe_rl.evaluation import evaluate as measure
 from safe_rl.evaluation.episodes import exploration
 
 QUICK = ("episodes=2", "num_envs=2", "num_threads=1")
@@ -46,7 +47,12 @@ def test_a_policy_of_the_package_is_loaded_and_evaluated_as_a_run(run, package, 
     assert evaluate(["certified/PointGoal1", *QUICK]) == 0
     assert "at 320 steps: 2 episodes" in capsys.readouterr().out
     # what is written lies in the working directory
-    assert (package.parent / "work/certified/PointGoal1/evaluation.json").is_file()
+    mine = package.parent / "work/certified/PointGoal1"
+    assert (mine / "evaluation.json").is_file()
+    (mine / "certificate.json").write_text("mine")  # the copy is not copied over
+    measure(str(package / "PointGoal1"), EvaluationOptions(episodes=2, num_envs=2))
+    assert (mine / "certificate.json").read_text() == "mine"
+    (mine / "certificate.json").unlink()
     assert {path.relative_to(package) for path in package.rglob("*")} == files
     assert evaluate(["certified/PointGaol1", *QUICK]) == 1
     assert "Did you mean 'PointGoal1'?" in capsys.readouterr().err
@@ -70,6 +76,12 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
     whole = sum(path.stat().st_size for path in (run / "checkpoints/last").iterdir())
     packed = sum(path.stat().st_size for path in (tmp_path / "packed").rglob("*.torchrl"))
     assert packed < whole / 2
+
+
+def test_an_option_of_an_export_is_checked(run, tmp_path, capsys):
+    assert export([str(run), str(tmp_path / "packed"), "actions=meen"]) == 1
+    assert "actions=meen: it must be '', 'mean' or 'sampled'" in capsys.readouterr().err
+    assert not (tmp_path / "packed").exists()
 
 
 def test_only_a_certified_policy_is_packed_as_certified(run, tmp_path):

@@ -25,7 +25,7 @@ def make_warp_physics(env: Any, model: mujoco.MjModel, outputs: Sequence[str]) -
     """Build the physics for the value "warp" of the key `physics`.
 
     Args:
-        env: The environment; another one of its class makes a trial on the CPU.
+        env: The environment; another one of its family makes a trial on the CPU.
         model: Its compiled world.
         outputs: Names of the fields of `MjData` that are read.
 
@@ -39,7 +39,8 @@ def make_warp_physics(env: Any, model: mujoco.MjModel, outputs: Sequence[str]) -
     require_extra("mujoco_warp", extra="gpu")
     from safe_rl.envs.physics.warp_physics import WarpPhysics
 
-    family: Any = type(env)
+    # a class of the user's may have another constructor
+    family: Any = next(c for c in type(env).__mro__ if c.__module__.startswith("safe_rl."))
     most, scale = most_contacts(config, family), config.physics_buffers
     contacts = _power_of_two(max(scale * most[0], _FEWEST_CONTACTS))
     constraints = _power_of_two(max(scale * most[1], _FEWEST_CONSTRAINTS))
