@@ -78,7 +78,7 @@ def test_workers_have_noise_of_their_own_whatever_seeding_does():
     ("num_collectors", "frames", "why"),
     [
         (4, 60, "num_envs must be a multiple"),
-        (2, 63, "num_envs must be a multiple"),
+        (2, 63, "63 cannot be shared equally among 6"),
         (0, 60, "num_collectors=0"),
     ],
 )
