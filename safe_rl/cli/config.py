@@ -248,6 +248,7 @@ def _check_parts(config: DictConfig) -> None:
         warnings.warn(
             f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
         )
+    # an algorithm of the user's own may do without some of them
     is_of_package = str(config.algo.get("_target_")).startswith("safe_rl.")
     for name in _NEEDED if is_of_package else ():
         part = config.get(name, "absent")
