@@ -31,6 +31,7 @@ API = {
     "safe_rl.scores.comparisons": "Intervals",
     "safe_rl.reporting": "Reports",
     "safe_rl.runs.table": "Tables of runs",
+    "safe_rl.runs.figures": "Figures of runs",
 }
 
 

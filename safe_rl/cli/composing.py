@@ -280,8 +280,8 @@ def refuse_changes(directory: Path, config: DictConfig) -> None:
     """
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     given: Any = OmegaConf.to_container(settings, resolve=True)
-    changed = differences(Run(directory).settings, given, "may_change")
-    for key, (before, now) in changed.items():
+    if changed := differences(Run(directory).settings, given, "may_change"):
+        key, (before, now) = next(iter(changed.items()))
         raise ValueError(
             f"{key}={now} cannot change in a run that is continued (it was {before}). You may "
             "change frames, keys of the machine such as checkpoint.interval, and single numbers "

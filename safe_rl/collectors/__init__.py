@@ -6,6 +6,11 @@ from safe_rl.collectors.accounting import (
     EpisodeStatistics,
     check_steps,
 )
+from safe_rl.collectors.building import (
+    make_collector,
+    make_process_collector,
+    make_ray_collector,
+)
 from safe_rl.collectors.datasets import (
     read_columns,
     read_dataset,
@@ -14,13 +19,7 @@ from safe_rl.collectors.datasets import (
     safety_gymnasium_columns,
 )
 from safe_rl.collectors.recording import Recording, StepRecorder, match_columns, read_recording
-from safe_rl.collectors.workers import (
-    WorkerCollector,
-    WorkerError,
-    make_collector,
-    make_process_collector,
-    make_ray_collector,
-)
+from safe_rl.collectors.workers import WorkerCollector, WorkerError
 
 __all__ = [
     "EpisodeAccounting",

@@ -15,11 +15,12 @@ from hydra.core.utils import JobReturn
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from safe_rl.cli.train import Summary, run_in_sweep
+from safe_rl.cli.sweeps import Summary, run_in_sweep
 from safe_rl.runs.checkpoints import read_facts
+from safe_rl.runs.figures import final_figures
+from safe_rl.runs.progress_bar import LINE_SECONDS, ProgressBar
 from safe_rl.runs.run import find_runs
-from safe_rl.runs.table import final_figures, read_table
-from safe_rl.runs.writing import LINE_SECONDS, ProgressBar
+from safe_rl.runs.table import read_table
 
 
 @pytest.mark.parametrize(("workers", "threads"), [(1, 8), (2, 4), (3, 2), (16, 1)])
@@ -56,8 +57,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         run_in_sweep(made, config.hydra, directory)
         summary.on_job_end(config, JobReturn())
 
-    monkeypatch.setattr("safe_rl.cli.train.run_job", run_job)
-    monkeypatch.setattr("safe_rl.cli.train.check_settings", lambda config: None)
+    monkeypatch.setattr("safe_rl.cli.sweeps.run_job", run_job)
+    monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")
     carry_out(0)

@@ -16,7 +16,7 @@ from point_mass_runs import point_mass_trainer as trainer_of_point_mass
 from run_configs import compose_config, point_mass_config, without_times
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.cli.train import check_same_run
+from safe_rl.cli.sweeps import check_same_run
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError

@@ -7,7 +7,7 @@ import pytest
 import torch
 from run_configs import compose_config, without_times
 
-from safe_rl.cli.train import run_job
+from safe_rl.cli.sweeps import run_job
 from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.run import Run
 from safe_rl.training import finish

@@ -6,8 +6,8 @@ import subprocess
 import pytest
 
 import safe_rl
-from safe_rl.runs import writing
-from safe_rl.runs.writing import code_of, commit_of, note_code
+from safe_rl.runs import code_version
+from safe_rl.runs.code_version import code_of, commit_of, note_code
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_code_that_resumes_a_run_stands_below_what_began_it(tmp_path, monkeypatc
 
     def noted(commit, steps):
         known = {"version": "1", "commit": commit, "changed": False}
-        monkeypatch.setattr(writing, "code_of", lambda: known)
+        monkeypatch.setattr(code_version, "code_of", lambda: known)
         note_code(path, steps)
         return [(entry["steps"], entry["commit"]) for entry in json.loads(path.read_text())]
 
