@@ -160,6 +160,7 @@ def hint_of_gymnasium(name: str) -> str:
 
 
 _STORED: dict[str, dict[str, Any]] = {}  # the nodes of `store_config` by name
+_IN_STORE: dict[str, dict[str, Any]] = {}  # what Hydra's ConfigStore has, by name
 
 
 def env_names() -> list[str]:
@@ -250,23 +251,24 @@ def store_configs(whole: Container[str] | None = None) -> None:
         whole: Names of those that have their keys; None: all. Of the others only the names can be
             listed. Hydra copies its store once per configuration group to print its help.
     """
-    nodes: dict[str, Any] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name, keys in (SUITE | EXTRAS | _STORED).items():
         base = {} if "_target_" in keys else {"defaults": [SAFETY_GYM, "_self_"]}
-        nodes[name] = {**base, "name": name, **keys}
+        rows[name] = {**base, "name": name, **keys}
     for name, row in VELOCITY_SUITE.items():
         values = {"_target_": VELOCITY_TARGET, "name": name, **row}
-        keys = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
-        nodes[name] = structured(name, keys)
+        rows[name] = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
     for name, family in FOREIGN.items():
         head = {"_target_": family.target, "name": "${.id}", "id": "???"}
-        rows = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
-        nodes[name] = structured(name, rows)
+        rows[name] = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
     if whole is not None:
-        nodes = {name: node if name in whole else {} for name, node in nodes.items()}
-    nodes[SAFETY_GYM] = structured("SafetyGym", {"name": Key(SAFETY_GYM, Text)} | KEYS)
-    for name, node in nodes.items():
-        ConfigStore.instance().store(name, node, GROUP)
+        rows = {name: row if name in whole else {} for name, row in rows.items()}
+    rows[SAFETY_GYM] = {"name": Key(SAFETY_GYM, Text), **KEYS}
+    for name, row in rows.items():
+        if row != _IN_STORE.get(name):  # to make the nodes of all takes a third of a second
+            is_typed = any(isinstance(value, Key) for value in row.values())
+            ConfigStore.instance().store(name, structured(name, row) if is_typed else row, GROUP)
+            _IN_STORE[name] = row
 
 
 def make_env(

@@ -68,20 +68,22 @@ class SimulatedEnv(ConstrainedEnv):
     ) -> Physics:
         if self.config.physics == "cpu":
             return BatchPhysics(model, self.batch_size[0], num_threads, outputs)
-        return make_warp_physics(self, model, outputs)
-
-    def _draw_dynamics(self, model: mujoco.MjModel, bodies: slice) -> None:
-        """Prepare the drawing of factors; `bodies` are the ids of the robot's bodies."""
-        scales = {key: getattr(self.config, key) for key in SCALES}
-        ranges = {key: value for key, value in scales.items() if isinstance(value, tuple)}
-        if not ranges:
-            return
-        if not isinstance(self._physics, BatchPhysics):
+        if ranges := self._ranges():  # before the physics, which takes seconds to build
             raise ConfigError(
                 f"'{next(iter(ranges))}' is a range, which 'physics' warp does not have: use "
                 "'physics' cpu, or one factor."
             )
-        self._dynamics = self._physics.draw_dynamics(model, ranges, bodies)
+        return make_warp_physics(self, model, outputs)
+
+    def _draw_dynamics(self, model: mujoco.MjModel, bodies: slice) -> None:
+        """Prepare the drawing of factors; `bodies` are the ids of the robot's bodies."""
+        if (ranges := self._ranges()) and isinstance(self._physics, BatchPhysics):
+            self._dynamics = self._physics.draw_dynamics(model, ranges, bodies)
+
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        """Keys that scale the dynamics by factors drawn from a range."""
+        scales = {key: getattr(self.config, key) for key in SCALES}
+        return {key: value for key, value in scales.items() if isinstance(value, tuple)}
 
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None

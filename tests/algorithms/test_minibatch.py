@@ -100,6 +100,7 @@ def test_losses_of_torchrls_get_the_advantages_of_the_batch(kind, settings):
         torch.testing.assert_close(found[name], expected[name].detach())
 
 
+@pytest.mark.long
 def test_compiled_and_plain_updates_agree():
     results = []
     for compile in (False, True):

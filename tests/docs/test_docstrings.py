@@ -15,6 +15,7 @@ MODULES = [
 ]
 
 
+@pytest.mark.docs
 @pytest.mark.parametrize("module", [name for name in MODULES if not name.endswith("__main__")])
 def test_examples(module, request, capsys):
     found = doctest.DocTestFinder().find(import_module(module))
