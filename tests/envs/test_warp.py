@@ -24,6 +24,8 @@ from safe_rl.training.building import build_trainer, seed_everything
 
 # kernels are compiled once for all tests, which takes a minute
 pytestmark = pytest.mark.long
+# in the plane, in space, and the one whose solver Warp lacks
+SHAPES = ("SafeHopperVelocity", "SafeAntVelocity", "SafeHumanoidVelocity")
 BUSY = {"robot_base": "point", "gremlins_num": 1, "vases_num": 1, "buttons_num": 1, "task": "goal"}
 BUSY |= {"constrain_gremlins": True, "constrain_vases": True, "observe_gremlins": True}
 
@@ -80,7 +82,13 @@ def test_one_step_is_that_of_mujoco(name, most):
     assert (apart > most).sum() <= 2
 
 
-@pytest.mark.parametrize("name", VELOCITY_SUITE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in SHAPES else [pytest.mark.slow])
+        for name in VELOCITY_SUITE
+    ],
+)
 def test_one_step_of_a_robot_is_that_of_mujoco(name):
     """Random actions from a start until most robots have fallen, each step from equal states."""
     cpu, warp = (

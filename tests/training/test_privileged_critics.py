@@ -35,6 +35,7 @@ RUNS = {
     ),
     "compiled": ("ppo_lagrangian", {**BATCH, "compile": True}),
 }  # fmt: skip
+SLOW = ("workers", "compiled", "td3", "cal")  # the last two build their critics as "sac" does
 
 
 def train(folder, name, **more):
@@ -81,10 +82,7 @@ def test_an_environment_without_it_is_refused(algo):
 @pytest.mark.long
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name in ("workers", "compiled") else name
-        for name in RUNS
-    ],
+    [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in RUNS],
 )
 def test_runs_learn_resume_and_act_without_it(name, tmp_path):
     whole = train(tmp_path / "whole", name, **READ)
