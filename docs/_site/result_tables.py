@@ -32,7 +32,7 @@ HEADS = {
     "new": "new episodes", "bound": "certified", "omnisafe": "OmniSafe, 10M steps",
     "paper": "Ray et al. (2019), 10M steps",
 }  # fmt: skip
-# The columns "PPOLag" of Table 2 of OmniSafe's benchmarks/on-policy/README.md, commit 005e482:
+# The columns "PPOLag" of Table 2 of OmniSafe's benchmarks/on-policy/README.md, commit 15603dd:
 # episode cost and return, each with its deviation.
 OMNISAFE = {
     "SafeAntVelocity": "12.1 ± 6.6 / 3262 ± 80",
