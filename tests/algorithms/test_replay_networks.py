@@ -72,7 +72,13 @@ class Seen(Walk):
         return self._observe(), self.speed, False, False, {"cost": float(self.place > 0)}
 
 
-@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian", "wcsac"])
+@pytest.mark.parametrize(
+    "algo",
+    [
+        "sac_lagrangian",
+        *(pytest.param(a, marks=pytest.mark.long) for a in ("td3_lagrangian", "wcsac")),
+    ],
+)
 def test_pictures_and_numbers_beside_them_are_learned_from(algo, tmp_path):
     env = from_gymnasium(Seen, num_envs=4, num_steps=20, flatten=False, seed=0)
     steps = ("memory.n_steps=3", "memory.capacity=1000")

@@ -294,6 +294,7 @@ def test_mappings_take_the_place_of_what_is_none(algo, key, value):
     assert OmegaConf.select(config, key) == value
 
 
+@pytest.mark.long
 def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypatch, capsys):
     def epoch_that_is_stopped(trainer, batches):
         signal.raise_signal(signal.SIGINT)
