@@ -265,7 +265,7 @@ def store_configs(whole: Container[str] | None = None) -> None:
         rows = {name: row if name in whole else {} for name, row in rows.items()}
     rows[SAFETY_GYM] = {"name": Key(SAFETY_GYM, Text), **KEYS}
     for name, row in rows.items():
-        if row != _IN_STORE.get(name):  # to make the nodes of all takes a third of a second
+        if row != _IN_STORE.get(name):  # nodes of all would take a third of a second
             is_typed = any(isinstance(value, Key) for value in row.values())
             ConfigStore.instance().store(name, structured(name, row) if is_typed else row, GROUP)
             _IN_STORE[name] = row
