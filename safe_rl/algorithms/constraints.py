@@ -128,7 +128,15 @@ class Constraints(Resumable):
         Args:
             batch: Steps of the current policy, [N, T], in order of time.
             episodes: Statistics of the episodes in the batch.
+
+        Raises:
+            ValueError: If the batch has another number of dimensions.
         """
+        if batch.ndim != 2:
+            raise ValueError(
+                f"The batch has the shape {list(batch.shape)}, and must have [N, T], environments "
+                "and steps: batch.unsqueeze(0) of one environment's."
+            )
         if self.tracker is None:
             return self._compare_episodes(batch, episodes)
         costs = torch.cat([batch["next", key] for key in self.keys], -1)
@@ -171,7 +179,7 @@ class Constraints(Resumable):
     def record_prediction(self, state: LimitState, metrics: Mapping[str, Tensor]) -> None:
         """Store the change of J_c that an update's surrogates predict, if it reports them."""
         if self.tracker is not None and "cost_surrogate" in metrics:
-            change = metrics["cost_surrogate"] * state.length
+            change = metrics["cost_surrogate"] * state.length_for(state.cost)
             self.tracker.predictions.record_prediction(change)
 
     def columns(self, state: LimitState, multiplier: Multiplier | None) -> dict[str, float]:

@@ -108,7 +108,7 @@ class CPOStep(TRPOStep):
         """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
         c = problem.required_decrease
         if self.rescale_violation:
-            c = (c / problem.length).nan_to_num(nan=0.0)
+            c = c / problem.length
         loss = finite_sum(problem.losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         return g, self._gradients(problem.surrogates), c

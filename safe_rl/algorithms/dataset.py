@@ -94,8 +94,15 @@ def _fill(
     env: EnvBase,
 ) -> str:
     """Put the transitions of a dataset into a replay buffer; return a sentence on them."""
-    actions = bounded_actions(env)
+    actions, is_recorded = bounded_actions(env), Path(node.path).is_dir()
     _check_entries(steps, buffer, env, actions)
+    held = env.steps_per_decision
+    known = interface.get("steps_per_decision", held if is_recorded else 1)
+    if known != held:
+        raise ValueError(
+            f"its actions are held for {known} step(s), and here for {held} "
+            "(transforms.action_repeat.k): rewards and costs are sums over these steps."
+        )
     costs = [("next", key) for key in env.cost_keys if ("next", key) in steps.keys(True)]
     check_steps({key: steps[key] for key in {*buffer.in_keys, *costs}}, costs)
     warning = _arrange(steps, interface, node, env)
@@ -111,7 +118,6 @@ def _fill(
             f"of its {number:,} transitions {taken:,} are taken{what}. There must be some, and "
             f"room for them: memory.capacity={buffer.capacity}."
         )
-    is_recorded = Path(node.path).is_dir()
     steps["action"] = _as_chosen(steps["action"], interface, is_recorded, env, actions)
     buffer.extend(steps)
     buffer.end_rows()

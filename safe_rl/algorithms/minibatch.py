@@ -248,9 +248,8 @@ class MinibatchUpdate(PolicyUpdate):
     def _diagnostics(history: list[TensorDictBase], num_steps: int) -> dict[str, Tensor]:
         steps = TensorDict.stack(history)
         means: dict[str, Tensor] = steps.float().mean(0).to_dict()
-        if "kl" in means:
-            means["kl"] = steps["kl"][-1]
-        return means | {"num_steps": torch.tensor(num_steps)}
+        last = {name: steps[name][-1] for name in ("kl", "cost_surrogate") if name in means}
+        return means | last | {"num_steps": torch.tensor(num_steps)}
 
     def loss_modules(self) -> dict[str, nn.Module]:
         """The loss."""

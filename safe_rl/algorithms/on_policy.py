@@ -79,7 +79,7 @@ class OnPolicy(Algorithm):
                 constrained algorithm gets no limit.
         """
         device, constraints = torch.device(config.device), Constraints.from_config(config, env)
-        multiplier = instantiate(config.get("lagrangian"), cost_limits=constraints.cost_limits)
+        multiplier = instantiate(config.get("lagrangian"), cost_limits=constraints.measured_limits)
         if multiplier is not None:
             multiplier.to(device)
         num_costs = len(constraints.keys)

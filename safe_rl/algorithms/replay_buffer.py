@@ -97,11 +97,11 @@ class Memory(Checked):
             keys_of.setdefault((gammas or {}).get(key, reward_gamma), []).append(key)
         # its default done_keys keep `terminated` of the first step, so that values would be
         # bootstrapped beyond an end within the n steps
-        self._sums = [
+        self._n_step_transforms = [
             MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
             for gamma, keys in keys_of.items()
         ]
-        self._spanned = ["steps_to_next_obs"] if self._sums else []
+        self._spanned = ["steps_to_next_obs"] if self._n_step_transforms else []
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -109,7 +109,7 @@ class Memory(Checked):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the steps [N, T] that follow those of the last call."""
-        self._add(self._summed(batch) if self._sums else [batch])
+        self._add(self._summed(batch) if self._n_step_transforms else [batch])
 
     def _add(self, pieces: list[TensorDictBase]) -> None:
         if not pieces:  # fewer than n steps so far
@@ -126,7 +126,7 @@ class Memory(Checked):
 
     def _over_steps(self, piece: TensorDictBase) -> TensorDictBase | None:
         """Transitions over n steps; None if there are fewer than n steps so far."""
-        first, *others = self._sums
+        first, *others = self._n_step_transforms
         transitions: TensorDictBase | None = first.inv(piece)
         for transform in others:
             sums = transform.inv(piece.select(*_read_by(transform)))
@@ -137,18 +137,18 @@ class Memory(Checked):
     def end_rows(self) -> None:
         """Complete the sums over n steps, because the next batch does not follow the last one."""
         # TorchRL has no public access to the steps whose sums are not complete
-        if not self._sums or self._sums[0]._buffer is None:
+        if not self._n_step_transforms or self._n_step_transforms[0]._buffer is None:
             return
-        waiting = self._sums[0]._buffer.clone()
+        waiting = self._n_step_transforms[0]._buffer.clone()
         waiting["next", "done"][..., -1, :] = True
         self._wait_with(waiting)
-        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._sums[0].n_steps)
+        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._n_step_transforms[0].n_steps)
         self._add([piece for piece in [self._over_steps(beyond)] if piece is not None])
         self._wait_with(None)
 
     def _wait_with(self, steps: TensorDictBase | None) -> None:
         """Set the last steps, whose sums are not complete."""
-        for number, transform in enumerate(self._sums):
+        for number, transform in enumerate(self._n_step_transforms):
             kept = steps if steps is None or not number else steps.select(*_read_by(transform))
             transform._buffer = kept
 
@@ -179,7 +179,7 @@ class Memory(Checked):
             # of a view, torch would save the whole underlying storage
             steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
-        tail = self._sums[0]._buffer if self._sums else None
+        tail = self._n_step_transforms[0]._buffer if self._n_step_transforms else None
         if tail is not None:
             state["tail"] = tail.clone().flatten_keys("/").to_dict()
             state["tail_shape"] = list(tail.batch_size)
@@ -201,7 +201,7 @@ class Memory(Checked):
         if self.is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
         self._wait_with(None)
-        if self._sums and "tail" in state_dict:
+        if self._n_step_transforms and "tail" in state_dict:
             tail, shape = state_dict["tail"], state_dict["tail_shape"]
             self._wait_with(self._restored(tail, shape, [("next", "done")]))
 

@@ -63,7 +63,7 @@ class StepProblem(NamedTuple):
     @property
     def length(self) -> Tensor:
         """T̄, scalar."""
-        return self._known_limits.length.to(self.surrogates)
+        return self._known_limits.length_for(self.surrogates)
 
     @property
     def _known_limits(self) -> LimitState:

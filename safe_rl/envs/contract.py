@@ -95,7 +95,7 @@ class ConstrainedEnv(EnvBase):
 
         ``columns`` are `column_names`, ``sensors`` the `sensor_keys`. ``actions`` has the bounds of
         actions as policies choose them, ``low`` and ``high``, and in the environment's own units,
-        ``own_low`` and ``own_high``; None for choices.
+        ``own_low`` and ``own_high``; None for choices. ``steps_per_decision`` is the attribute.
         """
         raw, spec, actions = self.action_bounds, self.action_spec_unbatched, None
         if raw is not None:
@@ -107,7 +107,12 @@ class ConstrainedEnv(EnvBase):
             }
             actions = {name: bound.flatten().tolist() for name, bound in bounds.items()}
         sensors = dict(self.sensor_keys)
-        return {"columns": self.column_names, "sensors": sensors, "actions": actions}
+        return {
+            "columns": self.column_names,
+            "sensors": sensors,
+            "actions": actions,
+            "steps_per_decision": self.steps_per_decision,
+        }
 
     def get_state(self) -> Any:
         """Return a copy of everything that determines what happens next, a TensorDict [N].

@@ -86,6 +86,7 @@ class ExploringPolicy(TensorDictModuleBase):
             action's range.
 
     Attributes:
+        samples: Whether the actor samples its actions, and gets no noise.
         is_random: Whether actions are uniformly random. It is a buffer, so the workers of a
             collector receive it with the weights.
 
@@ -114,8 +115,8 @@ class ExploringPolicy(TensorDictModuleBase):
         noise: float = 0.0,
     ) -> None:
         super().__init__()
-        self._samples = isinstance(actor, ProbabilisticTensorDictSequential)
-        network, sampler = (actor.module[0], actor.module[-1]) if self._samples else (actor, actor)
+        self.samples = isinstance(actor, ProbabilisticTensorDictSequential)
+        network, sampler = (actor.module[0], actor.module[-1]) if self.samples else (actor, actor)
         self.network, self.noise = network.module, noise
         # of a sampler, the log-probability comes second
         self.in_keys, self.out_keys = list(network.in_keys), list(sampler.out_keys[:1])
@@ -128,7 +129,7 @@ class ExploringPolicy(TensorDictModuleBase):
         outputs = self.network(*map(tensordict.get, self.in_keys))
         is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
-        if self._samples:
+        if self.samples:
             loc, scale = outputs
             inner = torch.addcmul(loc, scale, torch.randn_like(loc)) if is_noisy else loc
             action = self.low + half * (1 + inner.tanh())

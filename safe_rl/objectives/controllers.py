@@ -27,7 +27,7 @@ class PIMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: Initial λ, at most `highest`, for all costs or one per cost.
+        init: Initial λ for all costs or one per cost; at most `highest` counts.
         kp: Proportional gain K_P.
         ki: Integral gain K_I.
         saturation: Bound of the absolute value of the error Δ, in units of the limit.
@@ -56,7 +56,7 @@ class PIMultiplier(Multiplier):
         highest: PositiveFloat,
     ) -> None:
         super().__init__(cost_limits)
-        initial = per_cost("init", init, self.num_costs)
+        initial = per_cost("init", init, self.num_costs).clamp(0, highest)
         self.kp, self.ki, self.saturation, self.highest = kp, ki, saturation, highest
         self.register_buffer("penalty", initial)
         self.register_buffer("integral", initial.clone())

@@ -164,9 +164,9 @@ class CostCritics(QFunctionLoss):
         costs = torch.cat([self.column(tensordict, key) for key in self.cost_keys], -1)
         with torch.no_grad():
             values = self.values_of_costs(following, next_action, "target")
-            ends = self.column(tensordict, self.tensor_keys.terminated)
+            terminated = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
-            discount = discount_of(tensordict, self.cost_gamma, spanned) * ends.logical_not()
+            discount = discount_of(tensordict, self.cost_gamma, spanned) * terminated.logical_not()
         predicted = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
         loss = self.cost_errors(predicted, costs, discount, values).sum(-1).sum(0)
         return self._mean(loss, tensordict)

@@ -32,12 +32,14 @@ class LimitState:
     Attributes:
         cost: J_c, undiscounted cost per episode, [k].
         target: Present upper bound of J_c, [k]: d, or another value while the limit falls.
-        length: T̄, mean number of time steps of an episode, scalar.
+        length: T̄, mean number of time steps of an episode, scalar; None if nobody has said it, as
+            multipliers do not need it.
         unit: Typical size of one cost, [k]; see `EpisodeCosts.unit`. Losses weigh costs by
             λ / unit.
         scale: Unit of violations for controllers, [k]: d, or a larger value for limits near 0.
         realised_share: Share of a predicted change of J_c that is observed, [k].
-        integral: Weighted sum of earlier violations, which steps add to the present one, [k].
+        integral: Weighted sum of the violations so far, with this batch's, which steps add to the
+            present one, [k].
         is_new: Whether the batch has changed `cost`. If not, multipliers stay as they are.
 
     Examples:
@@ -48,7 +50,7 @@ class LimitState:
 
     cost: Tensor
     target: Tensor
-    length: Tensor
+    length: Tensor | None
     unit: Tensor
     scale: Tensor
     realised_share: Tensor
@@ -61,7 +63,7 @@ class LimitState:
         *,
         cost: Tensor | Sequence[float],
         limit: Tensor | Sequence[float],
-        length: Tensor | float = torch.nan,
+        length: Tensor | float | None = None,
         is_new: bool = True,
     ) -> LimitState:
         """The state without a tracker: the target is the limit d, and costs have the unit 1."""
@@ -70,7 +72,7 @@ class LimitState:
         return cls(
             cost=cost,
             target=limit,
-            length=torch.as_tensor(length).to(limit),
+            length=None if length is None else torch.as_tensor(length).to(limit),
             unit=torch.ones_like(limit),
             scale=torch.where(limit > 0, limit, 1.0),
             realised_share=torch.ones_like(limit),
@@ -114,7 +116,20 @@ class LimitState:
         divided by the episode's length.
         """
         decrease = self.required_decrease_for(surrogates)
-        return surrogates + (decrease / self.length.to(surrogates)).nan_to_num(nan=0.0)
+        return surrogates + decrease / self.length_for(surrogates)
+
+    def length_for(self, surrogates: Tensor) -> Tensor:
+        """T̄ with the dtype and device of surrogates.
+
+        Raises:
+            ValueError: If it is not known.
+        """
+        if self.length is None:
+            raise ValueError(
+                "The state of the limits has no episode length, by which violations are divided: "
+                "LimitState.of(cost=…, limit=…, length=…)."
+            )
+        return self.length.to(surrogates)
 
     def to(self, device: torch.device) -> LimitState:
         """The same on another device."""

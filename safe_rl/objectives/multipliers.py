@@ -124,6 +124,7 @@ class Multiplier(Checked, nn.Module, ABC):
                 f"update() needs one violation for each of {self.cost_keys}, "
                 f"got shape {tuple(state.violation.shape)}."
             )
+        state = state.to(self.limits.device)
         known = state.violation.isfinite() & state.is_new
         for name, new in self._step(state).items():
             buffer = self.get_buffer(name)
@@ -195,7 +196,7 @@ class ProjectedMultiplier(Multiplier):
 
     Args:
         cost_limits: Mapping from cost key to limit d, or limits alone; see `parse_cost_limits`.
-        init: Initial λ, at most `highest`, for all costs or one per cost.
+        init: Initial λ for all costs or one per cost; at most `highest` counts.
         lr: Step size α: change of λ per epoch if J_c is above its limit by the size u of one cost.
         highest: Upper bound λ_max of λ; None: no bound.
 
@@ -219,7 +220,7 @@ class ProjectedMultiplier(Multiplier):
     ) -> None:
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest
-        self.register_buffer("penalty", per_cost("init", init, self.num_costs))
+        self.register_buffer("penalty", per_cost("init", init, self.num_costs).clamp(0, highest))
 
     def _step(self, state: LimitState) -> dict[str, Tensor]:
         moved = self.penalty + self.lr * state.violation / state.unit

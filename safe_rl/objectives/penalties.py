@@ -15,17 +15,7 @@ from safe_rl.objectives.policy_losses import PPOLoss, clipped_gain
 from safe_rl.objectives.surrogate import WeighsCosts
 
 
-class PenaltyLoss(PPOLoss):
-    """PPO with a penalty on the predicted costs, for k constraints.
-
-    `prepare` has to be called with every batch: the penalties need J_c − d and T̄. Costs are
-    averaged over the samples for any ``reduction``. Arguments are those of `PPOLoss`.
-    """
-
-    has_costs = True
-
-
-class P3OLoss(PenaltyLoss):
+class P3OLoss(PPOLoss):
     """PPO with an exact penalty on the clipped cost surrogates, for k constraints.
 
     Minimises (Zhang et al. 2022, their clipped surrogates with an exact penalty)
@@ -60,6 +50,7 @@ class P3OLoss(PenaltyLoss):
         2.0
     """
 
+    has_costs = True
     extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate")
 
     def __init__(
@@ -101,7 +92,7 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
     return torch.where(slack > turn, inside, outside)
 
 
-class IPOLoss(PenaltyLoss):
+class IPOLoss(PPOLoss):
     """PPO with a logarithmic barrier at every limit, for k constraints.
 
     Minimises (Liu, Ding and Liu 2020, their logarithmic barrier, with κ = 1/t)
@@ -130,6 +121,7 @@ class IPOLoss(PenaltyLoss):
         True
     """
 
+    has_costs = True
     extra_out_keys = ("loss_barrier", "clip_fraction", "cost_surrogate")
 
     def __init__(
@@ -146,8 +138,7 @@ class IPOLoss(PenaltyLoss):
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)
-        # before the first batch T̄ is not known
-        kappa = (self.kappa / self._known_limits().length.to(surrogates)).nan_to_num(self.kappa)
+        kappa = self.kappa / self._known_limits().length_for(surrogates)
         return {
             **super()._surrogates(tensordict, log_weight),
             "loss_barrier": log_barrier(
@@ -205,7 +196,7 @@ class APPOLoss(WeighsCosts, PPOLoss):
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         state = self._known_limits()
         gain = -clipped_gain(log_weight, -self._cost_advantage(tensordict), self.clip_epsilon)
-        scale, unit, length = (x.to(gain) for x in (state.scale, state.unit, state.length))
+        scale, unit, length = state.scale.to(gain), state.unit.to(gain), state.length_for(gain)
         surrogates = unit * self._cost_surrogates(tensordict, gain)
         violation = state.excess(surrogates) * length / scale
         multiplier = self.multiplier.value.to(gain)

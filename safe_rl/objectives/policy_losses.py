@@ -90,8 +90,8 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
       below the unclipped one (Zhang et al. 2022, clipped costs);
     - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
 
-    This loss never trains the multipliers: call ``multiplier.update(mean_costs - limits)`` once per
-    epoch.
+    This loss never trains the multipliers: call ``multiplier.update(limits)`` once per epoch, with
+    a `LimitState`.
 
     Args:
         parts: Actor, and a multiplier with one λ per column of ``cost_advantage``.

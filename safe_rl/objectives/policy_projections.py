@@ -157,5 +157,5 @@ class CUPLoss(WeighsCosts):
         scale = 1 + self.cost_factor * self.multiplier.value.sum()
         return {
             "loss_objective": (divergence + self.cost_factor * penalty) / scale,
-            "cost_surrogate": self._cost_surrogates(tensordict, gain.detach()),
+            "cost_surrogate": self._unit(gain) * self._cost_surrogates(tensordict, gain.detach()),
         }

@@ -78,7 +78,9 @@ class ReplayLoss(Checked, SharesTensors):
 
     def critic_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the Q functions alone, for gradient steps that do not change the policy."""
-        raise NotImplementedError
+        raise NotImplementedError(
+            f"{type(self).__name__} has no Q functions: use policy_update.policy_delay=1."
+        )
 
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Learn the scales of costs and rewards: call it with every batch, before its updates.
@@ -143,7 +145,7 @@ class QFunctionLoss(ReplayLoss):
     def _td_targets(self, tensordict: TensorDictBase) -> Tensor:
         """TorchRL's TD targets [...]; TD(0), the default, is computed in half of TorchRL's time."""
         following = self._next_values(tensordict.get("next"))
-        reward, ends = (
+        reward, terminated = (
             self.column(tensordict, key)
             for key in (self.tensor_keys.reward, self.tensor_keys.terminated)
         )
@@ -152,7 +154,7 @@ class QFunctionLoss(ReplayLoss):
             steps = tensordict.clone(False).set(("next", estimator.tensor_keys.value), following)
             return estimator.value_estimate(steps).squeeze(-1)
         discount = discount_of(tensordict, self.gamma, estimator.tensor_keys.steps_to_next_obs)
-        return (reward + discount * ends.logical_not() * following).squeeze(-1)
+        return (reward + discount * terminated.logical_not() * following).squeeze(-1)
 
     def _next_values(self, following: TensorDictBase) -> Tensor:
         """Values [..., 1] of the next states, on which the Q functions bootstrap."""

@@ -309,7 +309,11 @@ class WeighsCosts(SurrogateLoss):
     def _cost_advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Cost advantages in units of one cost, A_c / u, [..., k]."""
         advantage = super()._cost_advantage(tensordict)
-        return advantage if self.limits is None else advantage / self.limits.unit.to(advantage)
+        return advantage / self._unit(advantage)
+
+    def _unit(self, like: Tensor) -> Tensor | float:
+        """u, [k], with the dtype and device of a tensor."""
+        return 1.0 if self.limits is None else self.limits.unit.to(like)
 
     def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""

@@ -147,6 +147,13 @@ def test_recorded_actions_are_those_of_the_policy(tmp_path):
     about = {"actions": {"low": [0.0], "high": [2.0], "own_low": [0.0], "own_high": [2.0]}}
     Recording(tmp_path / "other", env.cost_keys, about).write(0, steps)
     assert learned_actions(tmp_path / "other", env) == [-0.75]
+    with pytest.raises(ValueError, match=r"held for 4 step\(s\), and here for 1"):
+        learned_actions(recorded(tmp_path / "held", env, steps, steps_per_decision=4), env)
+
+
+def recorded(folder, env, steps, **interface):
+    Recording(folder, env.cost_keys, env.interface | interface).write(0, steps)
+    return folder
 
 
 def test_columns_are_taken_by_their_names(tmp_path):

@@ -166,6 +166,13 @@ def test_a_batch_beyond_the_limit_before_the_first_step_is_reported():
     assert all(map(torch.equal, actor.parameters(), before))
 
 
+class Falling(RecordingLoss):
+    """Each step predicts a lower cost."""
+
+    def forward(self, batch):
+        return super().forward(batch).set("cost_surrogate", torch.tensor(1.0 - len(self.seen)))
+
+
 class Overflowing(RecordingLoss):
     """Finite at first, infinite from the third call on."""
 
@@ -174,6 +181,12 @@ class Overflowing(RecordingLoss):
         if len(self.seen) > 2:
             losses["loss_objective"] = losses["loss_objective"] * torch.inf
         return losses
+
+
+def test_predicted_costs_are_those_after_the_passes():
+    """Their mean over the steps is about half of the change that an update predicts."""
+    update = MinibatchUpdate(Falling(), optimizer=adam, num_passes=4, minibatch_size=None)
+    assert update(samples(20))["cost_surrogate"] == -3.0
 
 
 def test_the_step_after_a_loss_that_is_no_number_is_not_taken():

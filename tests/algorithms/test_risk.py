@@ -243,6 +243,12 @@ def test_a_tail_costs_more_than_the_mean(tmp_path):
     assert all(tail > mean for tail, mean in pairs if mean > 0)
 
 
+def test_errors_of_a_controller_are_in_units_of_the_measures_limit(tmp_path):
+    words = ["algo=ppo_lagrangian", "lagrangian=pid", "risk=chance"]
+    algorithm = point_mass_trainer(tmp_path, *words, "cost_limits={cost_hazards: 2}").algorithm
+    assert algorithm.multiplier.limits.tolist() == [*algorithm.constraints.measured_limits.values()]
+
+
 def test_limits_of_whole_batches_take_no_tails(tmp_path):
     with pytest.raises(ValueError, match=r"^risk: .*limits=null"):
         train(tmp_path, "algo=ppo_lagrangian", "risk=cvar", "limits=null")

@@ -1,6 +1,7 @@
 """MuJoCo Warp beside MuJoCo, on Warp's CPU device."""
 
 import pickle
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -10,11 +11,8 @@ from omegaconf import OmegaConf
 from run_configs import compose_config
 from torchrl.envs.utils import check_env_specs
 
-pytest.importorskip("mujoco_warp")
-
 from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
 from safe_rl.envs.physics import BatchPhysics
-from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.safety_gym.suite import resolve
@@ -22,8 +20,12 @@ from safe_rl.envs.velocity import VELOCITY_SUITE
 from safe_rl.runs.identity import experiment_of
 from safe_rl.training.building import build_trainer, seed_everything
 
-# kernels are compiled once for all tests, which takes a minute
-pytestmark = pytest.mark.long
+# kernels are compiled once for all tests, which takes a minute; imported by the tests themselves,
+# as collecting should not take five seconds more
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(not find_spec("mujoco_warp"), reason="comes with the extra gpu"),
+]
 # in the plane, in space, and the one whose solver Warp lacks
 SHAPES = ("SafeHopperVelocity", "SafeAntVelocity", "SafeHumanoidVelocity")
 BUSY = {"robot_base": "point", "gremlins_num": 1, "vases_num": 1, "buttons_num": 1, "task": "goal"}
@@ -263,6 +265,8 @@ def test_training_and_a_certificate_on_warp(env, algo, choice, device, tmp_path)
 @pytest.fixture(scope="module")
 def two():
     """Two simulations of a small model, and the model."""
+    from safe_rl.envs.physics.warp_physics import WarpPhysics
+
     model = build_scene(resolve(BUSY)).model
     return model, WarpPhysics(model, 2, "cpu", contacts=64, constraints=256)
 
@@ -293,6 +297,8 @@ def test_each_simulation_takes_its_own_number_of_substeps(two):
 
 
 def test_a_lack_of_room_is_an_error_that_names_the_key(two):
+    from safe_rl.envs.physics.warp_physics import BufferOverflowError, WarpPhysics
+
     physics = WarpPhysics(two[0], 2, "cpu", contacts=1, constraints=256)
     with pytest.raises(BufferOverflowError, match=r"room for 1 contacts.*env\.physics_buffers"):
         physics.step(5)

@@ -1,14 +1,16 @@
 """The golden transitions on MuJoCo Warp, in float32: one step from every recorded state."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 import torch
 from golden import NAMES, load
 from test_golden import assert_components, states
 
-pytest.importorskip("mujoco_warp")
-
 from safe_rl.envs import SafetyGymEnv
+
+pytestmark = pytest.mark.skipif(not find_spec("mujoco_warp"), reason="comes with the extra gpu")
 
 QUICK = ("point_goal_hazards", "doggo_z")
 NEAR, FAR = 1e-5, 1e-3  # m or rad

@@ -253,14 +253,23 @@ def test_before_any_batch_the_policy_counts_as_at_its_limit():
     loss = P3OLoss(actor, kappa=20.0, **FREE)
     with pytest.raises(ValueError, match=r"call prepare\(batch, limits\)"):
         loss(batch)
-    told(loss, torch.nan, length=torch.nan)
+    told(loss, torch.nan)
     loss.clip_epsilon.fill_(1e6)
     assert loss(batch)["loss_penalty"].abs() < 1e-5
-    loss = told(IPOLoss(actor, kappa=0.5, max_weight=10.0, **FREE), torch.nan, length=torch.nan)
+    loss = told(IPOLoss(actor, kappa=50.0, max_weight=10.0, **FREE), torch.nan)
     loss.clip_epsilon.fill_(1e6)
-    # the barrier's tangent at κ / w, extended to 0
+    # the barrier's tangent at κ / (w T̄), extended to 0
     expected = -0.5 * math.log(0.5 / 10.0) + 0.5
     assert loss(batch)["loss_barrier"].item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_violation_without_the_length_of_episodes_is_refused():
+    """Taken for no violation, it once made P3O ignore a cost of four times the limit."""
+    actor, _, batch = one_state(GAIN, COST)
+    loss = P3OLoss(actor, kappa=20.0, **FREE)
+    loss.prepare(batch, LimitState.of(cost=[100.0], limit=[25.0]))
+    with pytest.raises(ValueError, match="no episode length"):
+        loss(batch)
 
 
 @pytest.mark.parametrize("name", LOSSES)

@@ -29,7 +29,8 @@ def test_two_updates_by_hand():
 
 
 def test_the_integral_is_not_wound_up_beyond_what_it_can_put_out():
-    multiplier = PIMultiplier(25.0, **GAINS)
+    multiplier = PIMultiplier(25.0, **GAINS | {"init": 9.0})
+    assert multiplier.value == 5.0
     for _ in range(200):
         multiplier.update(state(75.0, limit=25.0))
     assert multiplier.value == 5.0

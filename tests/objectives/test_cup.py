@@ -61,6 +61,8 @@ def test_it_is_the_equation():
     padded = TensorDict.cat([batch.reshape(-1), torch.full_like(batch.reshape(-1), 7.0)])
     padded["collector", "mask"] = torch.arange(64) < 32
     torch.testing.assert_close(loss(padded)["loss_objective"], expected)
+    loss.prepare(batch, limit_state(0.0, 0.0, unit=[5.0, 2.0]))  # weighted, and reported as it is
+    torch.testing.assert_close(loss(batch)["cost_surrogate"], costs.detach())
 
 
 def test_the_projection_has_the_optimum_of_its_equation():

@@ -239,3 +239,9 @@ def test_another_default_dtype_of_torch_changes_nothing():
 def test_a_loop_of_ones_own_is_told_of_a_limit_below_zero():
     with pytest.raises(ValueError, match=r"cost_limits=.*greater than or equal to 0"):
         Constraints({"cost": -1.0})
+
+
+def test_batches_of_one_environment_need_their_dimension():
+    batch = TensorDict(next={"cost": torch.ones(5, 1)}, batch_size=[5])
+    with pytest.raises(ValueError, match=r"shape \[5\].*batch\.unsqueeze\(0\)"):
+        Constraints({"cost": 1.0}).update(batch, None)

@@ -1,6 +1,7 @@
 """The results in the repository: complete, readable, and what is said of them is what they hold."""
 
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,17 @@ PAGE = (RESULTS / "README.md").read_text()
 ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
 QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
 ROWS = [row for row in ALL_ROWS if row not in QUARTERS]
-RUNS = {path.parent.name: read_archive(path.parent) for path in RESULTS.glob(f"*/{FILE}")}
 # steps that a column is of, where it is not half a million
 WIDTHS = {"doggo": 2_000_000}
 STOPPED = {"hard_tasks", "privileged_trials"}  # of exploration, runs that were stopped are kept too
+
+pytestmark = pytest.mark.docs
+
+
+@cache
+def archives():
+    """The runs of every campaign, read when a test needs them: they take six seconds."""
+    return {path.parent.name: read_archive(path.parent) for path in RESULTS.glob(f"*/{FILE}")}
 
 
 def test_every_run_can_be_reported_and_every_campaign_is_listed():
@@ -42,7 +50,7 @@ def columns_of(run):
 
 @pytest.mark.parametrize(("run", "row"), ROWS)
 def test_the_figures_are_those_of_the_tables(run, row):
-    campaign, found = next((c, runs[run]) for c, runs in RUNS.items() if run in runs)
+    campaign, found = next((c, runs[run]) for c, runs in archives().items() if run in runs)
     width = WIDTHS.get(campaign, 500_000)
     steps, returns, costs = columns_of(found)
     cells, share = re.fullmatch(r"(.*) \|\s+(\d+ %)", row).groups()
@@ -58,7 +66,7 @@ def test_the_figures_are_those_of_the_tables(run, row):
 
 @pytest.mark.parametrize(("run", "row"), QUARTERS)
 def test_the_figures_under_other_limits_are_those_of_tables_and_certificates(run, row):
-    found = RUNS["limits"][run]
+    found = archives()["limits"][run]
     steps, returns, costs = columns_of(found)
     *quarters, certificate = row.split(" | ")
     assert len(quarters) == 4
