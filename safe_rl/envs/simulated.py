@@ -34,6 +34,7 @@ class SimulatedEnv(ConstrainedEnv):
     """
 
     reuses_tensors = False
+    steps_after_end = True
     #: Flags of a step, all of them False after a reset.
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Default camera of pictures.

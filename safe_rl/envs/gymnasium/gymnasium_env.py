@@ -127,6 +127,9 @@ class CheckedSteps(gymnasium.Wrapper):
         if not isinstance(info, dict):
             raise self._wrong("info", "a dictionary", info)
         self._check("observation", self.observation_space, values[0])
+        if COST_SUM in info and COST_SUM not in self._cost_keys:  # no kind of its own
+            info = {COST: info[COST_SUM], **info}
+            del info[COST_SUM]
         costs = {key: self._number(f"info['{key}']", info[key]) for key in self._costs_of(info)}
         for name, end in zip(("terminated", "truncated"), values[2:], strict=True):
             if not isinstance(end, bool | np.bool_ | int | np.integer):
@@ -200,7 +203,7 @@ class CheckedSteps(gymnasium.Wrapper):
         )
 
 
-class SixValues(gymnasium.Wrapper):
+class CostIntoInfo(gymnasium.Wrapper):
     """An environment whose step returns (observation, reward, cost, terminated, truncated, info).
 
     The wrapper's step returns Gymnasium's five values, with the cost in `info`.
@@ -216,8 +219,7 @@ class SixValues(gymnasium.Wrapper):
                 "values and has the cost in info, use env=gymnasium."
             )
         observation, reward, cost, terminated, truncated, info = values
-        others = {key: value for key, value in info.items() if key != COST_SUM}
-        return observation, reward, terminated, truncated, {**others, COST: float(cost)}
+        return observation, reward, terminated, truncated, {**info, COST: float(cost)}
 
 
 class CostReader(BaseInfoDictReader):

@@ -27,7 +27,7 @@ from safe_rl.envs.velocity.velocity_config import (
 )
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
-EPISODE_COST = "episode_cost"  # the sum over an episode, in the info of its last step
+EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
 NUM_SEEDS = 2**62
 RENDER_MODES = ["rgb_array"]
 
@@ -133,6 +133,8 @@ class Worlds:
         infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
         infos |= {key: column[key] for key in self.batch.events}
         self._episode_cost += infos[COST]
+        # at every step, because wrappers such as `TimeLimit` may end the episode after any of them
+        infos[EPISODE_COST] = self._episode_cost.copy()
         values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
         return arrays_of(step["observation"]), values, infos
 
