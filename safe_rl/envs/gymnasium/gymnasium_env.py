@@ -23,7 +23,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.keys import COST, ConfigError, is_cost
-from safe_rl.envs.pictures import resize
+from safe_rl.envs.pictures import chosen_rows, resize
 from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
@@ -297,9 +297,9 @@ class GymnasiumEnv(TorchRLEnv):
         frames = self.base_env._env.render()
         if frames is None or frames[0] is None:
             raise ValueError("The environment draws no frames: set env.render_mode=rgb_array.")
-        chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
+        chosen, is_one = chosen_rows(rows, len(frames))
         drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
-        return drawn[0] if isinstance(rows, int) else drawn
+        return drawn[0] if is_one else drawn
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:

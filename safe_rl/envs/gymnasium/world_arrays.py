@@ -24,6 +24,7 @@ from safe_rl.envs.velocity.velocity_config import (
     VELOCITY_SUITE,
     VelocityConfig,
     resolve_velocity,
+    velocity_name,
 )
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
@@ -156,7 +157,7 @@ def batch_of(
         raise ConfigError(f"config='{config}' is a name: give keys, as make_env('{config}').config")
     base: Any = SafetyGymConfig()
     if name is not None:
-        base = resolve_velocity(name) if name in VELOCITY_SUITE else resolve(name)
+        base = resolve_velocity(name) if velocity_name(name) in VELOCITY_SUITE else resolve(name)
     if config is None or isinstance(config, Mapping):
         whole = base.replace(**(config or {}))
     elif isinstance(config, type(base)):
