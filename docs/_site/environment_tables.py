@@ -76,8 +76,8 @@ def _suite_table(names: Iterable[str]) -> str:
     for name in names:
         env = SafetyGymEnv(name, num_envs=1)
         kinds = [f"`{key}`" for key in env.cost_keys if key not in ("cost", EXCEPTION_KEY)]
-        objects = {e.kind: len(e.names(env.config)) for e in ELEMENTS}
-        there = [f"{n} {kind if n > 1 else kind[:-1]}" for kind, n in objects.items() if n]
+        numbers = [(len(e.names(env.config)), e) for e in ELEMENTS]
+        there = [f"{n} {e.kind if n > 1 else e.label}" for n, e in numbers if n]
         rows.append([f"`{name}`", *_sizes(env), ", ".join(kinds) or "none", ", ".join(there)])
     return table(["`env=`", "size of observation", "size of action", "costs", "objects"], rows)
 

@@ -70,6 +70,8 @@ class ConstrainedEnv(EnvBase):
     #: Whether `_step` and `_reset` may return the tensors of an earlier call, as environments of
     #: users may; then what they return is copied.
     reuses_tensors: bool = True
+    #: Whether `_step` may be called for rows that have ended, if nobody reads what they return.
+    steps_after_end: bool = False
 
     @property
     def action_bounds(self) -> tuple[Tensor, Tensor] | None:

@@ -7,7 +7,7 @@ cell can run twice. Environments that exist already do not change.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,22 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.envs.keys import ConfigError, Key
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import ROBOTS, infer_key, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config import (
+    KEYS,
+    ROBOTS,
+    infer_key,
+    registered_keys,
+    set_registered_keys,
+)
 from safe_rl.envs.safety_gym.config_keys import Locations, Objects, Placements
-from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY, Cost, contact_cost, hazard_cost
+from safe_rl.envs.safety_gym.costs import (
+    BUILT_IN_COSTS,
+    COSTS,
+    EXCEPTION_KEY,
+    Cost,
+    contact_cost,
+    hazard_cost,
+)
 from safe_rl.envs.safety_gym.elements import (
     BOX,
     BY_KIND,
@@ -32,7 +45,7 @@ from safe_rl.envs.safety_gym.elements import (
 )
 from safe_rl.envs.safety_gym.observations import READINGS, Reading
 from safe_rl.envs.safety_gym.robots import load_robot
-from safe_rl.envs.safety_gym.tasks import TASKS, NextGoal, Task
+from safe_rl.envs.safety_gym.tasks import BUILT_IN_TASKS, TASKS, Task
 from safe_rl.envs.safety_gym.world import World
 from safe_rl.naming import did_you_mean
 
@@ -45,7 +58,6 @@ __all__ = [
     "Geom",
     "Key",
     "Motion",
-    "NextGoal",
     "Reading",
     "Task",
     "World",
@@ -60,8 +72,8 @@ __all__ = [
 
 _BUILT_IN = {
     "element": frozenset(BY_KIND),
-    "task": frozenset(TASKS),
-    "cost": frozenset(["cost", EXCEPTION_KEY, *(row.key for row in COSTS)]),
+    "task": BUILT_IN_TASKS,
+    "cost": BUILT_IN_COSTS | {"cost", EXCEPTION_KEY},
     "observation": frozenset(row.name for row in READINGS),
     "robot": frozenset(ROBOTS),
 }
@@ -81,7 +93,8 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
             default has no clear type (None, an empty tuple), give `Key(default, annotation)`.
 
     Raises:
-        ConfigError: If the kind, its label or a key is taken, or a default cannot be used.
+        ConfigError: If the kind, its label or a key is taken, a default cannot be used, or the flag
+            is no key.
 
     Examples:
         >>> puddle = Element(
@@ -99,6 +112,8 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
         0.1
     """
     _refuse_taken("element", element.kind)
+    standard = _keys_of(element)
+    _refuse_unknown_flags((element.flag,) if element.flag else (), {**standard, **(keys or {})})
     others = [row for row in ELEMENTS if row.kind != element.kind]
     if element.label in {"robot", "floor", *(row.label for row in others)}:
         raise ConfigError(f"Another object is called '{element.label}': choose another label.")
@@ -107,7 +122,7 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
             f"There is only one object if 'label' and 'kind' are both '{element.kind}': give "
             f"another label, or remove '{element.kind}_num'."
         )
-    _add_keys(keys, _keys_of(element))
+    _add_keys(keys, standard)
     # Rows of one motion stand together, because slots, bodies and `qpos` are in their order.
     place = 1 + max(i for i, row in enumerate(others) if row.motion is element.motion)
     ELEMENTS[:] = [*others[:place], element, *others[place:]]
@@ -134,10 +149,10 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
     """
     _refuse_taken("task", name)
     for kinds in (task.elements, task.touches, task.at_origin):
-        _refuse_unknown_kinds(kinds)
+        _refuse_unknown("element", kinds, BY_KIND)
     for kind in (kind for kind in task.elements if BY_KIND[kind].label != kind):
         raise ConfigError(f"Task '{name}' cannot add '{kind}': set the key '{kind}_num' instead.")
-    if (task.met or task.next_goal) and "goal" not in task.elements:
+    if (task.met or task.goal_at_button) and "goal" not in task.elements:
         raise ConfigError(f"Task '{name}' meets or draws goals: add 'goal' to its elements.")
     _add_keys(keys)
     TASKS[name] = task
@@ -152,7 +167,7 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
         keys: Its configuration keys with their defaults.
 
     Raises:
-        ConfigError: If the key is taken or badly named, or the row names unknown elements.
+        ConfigError: If the key is taken or badly named, or the row names unknown elements or keys.
 
     Examples:
         >>> speeding = Cost(
@@ -165,7 +180,8 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
     _refuse_taken("cost", cost.key)
     if not cost.key.startswith("cost_"):
         raise ConfigError(f"The cost key '{cost.key}' must start with 'cost_'.")
-    _refuse_unknown_kinds(cost.touches)
+    _refuse_unknown("element", cost.touches, BY_KIND)
+    _refuse_unknown_flags(cost.flags, keys)
     _add_keys(keys)
     COSTS[:] = [*(row for row in COSTS if row.key != cost.key), cost]
     forget_scenes()
@@ -179,7 +195,7 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
         keys: Its configuration keys with their defaults.
 
     Raises:
-        ConfigError: If the name or a key is taken, or the row names unknown elements.
+        ConfigError: If the name or a key is taken, or the row names unknown elements or keys.
 
     Examples:
         >>> height = Reading(
@@ -191,7 +207,8 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
         >>> register_observation(height, keys={"observe_height": False})
     """
     _refuse_taken("observation", reading.name)
-    _refuse_unknown_kinds(reading.touches)
+    _refuse_unknown("element", reading.touches, BY_KIND)
+    _refuse_unknown_flags(reading.flags, keys)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
     forget_scenes()
@@ -214,12 +231,18 @@ def _refuse_taken(what: str, name: str) -> None:
         raise ConfigError(f"'{name}' is a built-in {what}: choose another name.")
 
 
-def _refuse_unknown_kinds(kinds: Iterable[str]) -> None:
-    if isinstance(kinds, str):
-        raise ConfigError(f"'{kinds}' is a text: give the kinds in a tuple, ('{kinds}',).")
-    for kind in (kind for kind in kinds if kind not in BY_KIND):
-        hint = did_you_mean(kind, BY_KIND)
-        raise ConfigError(f"There is no element '{kind}'.{hint} Register the element first.")
+def _refuse_unknown(
+    what: str, names: Iterable[str], known: Collection[str], remedy: str = "Register it first."
+) -> None:
+    if isinstance(names, str):
+        raise ConfigError(f"'{names}' is a text: give the {what}s in a tuple, ('{names}',).")
+    for name in (name for name in names if name not in known):
+        raise ConfigError(f"There is no {what} '{name}'.{did_you_mean(name, known)} {remedy}")
+
+
+def _refuse_unknown_flags(flags: Iterable[str], keys: Mapping[str, Any] | None) -> None:
+    """Refuse flags that are no keys; `keys` are those that the row adds."""
+    _refuse_unknown("key", flags, {**KEYS, **(keys or {})}, "Add it to 'keys'.")
 
 
 def _keys_of(element: Element) -> dict[str, Key]:

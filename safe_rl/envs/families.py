@@ -38,6 +38,7 @@ from safe_rl.envs.velocity.velocity_config import (
     VELOCITY_SUITE,
     VelocityConfig,
     resolve_velocity,
+    velocity_name,
 )
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import allow, locate
@@ -55,7 +56,7 @@ _RANGES = (
     "costs of leaving a range: cost_<kind> -> [column of the observation, lowest, highest], of "
     "another entry [entry, column, lowest, highest]"
 )
-_HIDDEN = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
+_PRIVILEGED = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
 _MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
 _COMMON = {
     "cost_keys": Key(
@@ -90,7 +91,7 @@ FOREIGN = {
         "safe_rl.envs.gymnasium.make_gymnasium",
         {
             **_COMMON,
-            "privileged": _HIDDEN,
+            "privileged": _PRIVILEGED,
             "render_mode": _MODE,
             "outside": Key(None, Any, _RANGES),
             "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
@@ -107,7 +108,7 @@ FOREIGN = {
         {
             **_COMMON,
             "observe": Key(None, tuple[Text, ...] | None, "entries; null: `observation` or all"),
-            "privileged": _HIDDEN,
+            "privileged": _PRIVILEGED,
             "flatten": Key(True, bool, "true: several entries become one vector"),
             "outside": Key(None, Any, _RANGES),
             "cost": Key(None, Any, "a function from a step to its cost: my_module:function, or "
@@ -179,7 +180,7 @@ def env_node(env: str | SafetyGymConfig | VelocityConfig, name: str = "") -> dic
             return dict(_STORED[env])
         if env in FOREIGN:
             return {"_target_": FOREIGN[env].target}
-        if env in VELOCITY_SUITE:
+        if velocity_name(env) in VELOCITY_SUITE:
             return env_node(resolve_velocity(env), env)
         if env.removeprefix("Safexp-").removesuffix("-v0") not in SUITE | EXTRAS:
             hint = did_you_mean(env, [*env_names(), *FOREIGN, *_STORED])
@@ -333,9 +334,7 @@ def make_env(
         check_constrained_env(batch)
     if list(batch.batch_size) != [num_envs]:
         number = batch.batch_size[0]
-        raise ContractError(
-            f"{target} made {number} environments instead of {num_envs}, 'num_envs'."
-        )
+        raise ContractError(f"{target} made {number} environments instead of num_envs={num_envs}.")
     return batch
 
 

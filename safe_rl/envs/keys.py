@@ -130,7 +130,7 @@ def structured(name: str, keys: Mapping[str, Key]) -> type:
 
 
 def _hydra_type(annotation: Any) -> Any:
-    """Return the most special type that OmegaConf knows for an annotation."""
+    """Return the most specific type that OmegaConf knows for an annotation."""
     origin, inner = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _hydra_type(inner[0])

@@ -8,12 +8,13 @@ MuJoCo even then.
 from __future__ import annotations
 
 import importlib
+import operator
 import os
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -41,6 +42,13 @@ PACKAGES = {
 
 class OpenGLError(RuntimeError):
     """Nothing can be drawn on this machine; the message names the package to install."""
+
+
+def chosen_rows(rows: Any, num_envs: int) -> tuple[list[int], bool]:
+    """Return the indices of one row, some, or all (None), and whether it is one integer."""
+    is_one = isinstance(rows, int) or getattr(rows, "ndim", None) == 0
+    chosen = range(num_envs) if rows is None else [rows] if is_one else rows
+    return [operator.index(row) for row in chosen], is_one
 
 
 def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:

@@ -19,6 +19,7 @@ from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, checked
 from safe_rl.envs.physics import OUTPUTS, BatchPhysics, Physics
 from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
 from safe_rl.envs.physics.warp_backend import make_warp_physics
+from safe_rl.envs.pictures import chosen_rows
 
 
 class SimulatedEnv(ConstrainedEnv):
@@ -34,6 +35,7 @@ class SimulatedEnv(ConstrainedEnv):
     """
 
     reuses_tensors = False
+    steps_after_end = True
     #: Flags of a step, all of them False after a reset.
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Default camera of pictures.
@@ -288,11 +290,10 @@ class SimulatedEnv(ConstrainedEnv):
         """
         if min(width, height) < 1:
             raise ValueError(f"A frame needs at least one pixel, got {width} x {height}.")
-        everyone = range(self.batch_size[0])
-        chosen = [rows] if isinstance(rows, int) else list(everyone if rows is None else rows)
+        chosen, is_one = chosen_rows(rows, self.batch_size[0])
         camera = self.first_camera if camera is None else camera
         frames = self._renderer.frames(chosen, self._has_cost, camera, width, height)
-        return frames[0] if isinstance(rows, int) else frames
+        return frames[0] if is_one else frames
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the resources of OpenGL."""

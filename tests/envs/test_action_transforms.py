@@ -128,6 +128,22 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     assert torch.equal(held["observation"][1, -1], steps["observation"][1, -1])
 
 
+def test_episodes_of_a_row_do_not_depend_on_other_rows():
+    torch.manual_seed(0)
+    actions = 2 * torch.rand(4, 60, 3) - 1
+
+    def play(rows):
+        env = make_env("SafeHopperVelocity", num_envs=rows, seed=0)
+        env = transformed(env, "noise", repeat=ActionRepeat(4), seed=0)
+        left = iter(actions[:rows].unbind(1))
+        steps = env.rollout(60, lambda td: td.set("action", next(left)), break_when_any_done=False)
+        return env.get_state()["episode"][0], steps["observation"][0]
+
+    (episode, seen), (one, alone) = play(4), play(1)
+    assert episode == one > 5
+    assert torch.equal(seen, alone)
+
+
 @pytest.mark.parametrize("other", [ActionDelay(2), EarlyTermination({"cost": 2.0})])
 def test_others_beside_a_repeat_would_act_once_per_decision_and_are_refused(other):
     env = TransformedEnv(PointMass(2), Compose(other, ActionRepeat(4)))

@@ -16,6 +16,14 @@ def test_a_file_of_ones_own_is_not_taken_for_the_bundled_one(tmp_path, monkeypat
         SafetyGymEnv({"robot_base": "xmls/car.xml"})
 
 
+def test_more_locations_than_objects_are_told_and_ignored():
+    keys = {"robot_base": "point", "hazards_num": 1, "hazards_locations": [[1, 0], [0, 1]]}
+    with pytest.warns(UserWarning, match="'hazards_locations' has 2 locations for 1 objects"):
+        env = SafetyGymEnv(keys, num_threads=1)
+    env.reset()
+    assert env.get_positions()["hazards"][0, :, :2].tolist() == [pytest.approx([1, 0], abs=1e-6)]
+
+
 def test_values_of_numpy_are_those_of_python():
     given = {
         **{"hazards_num": np.int64(3), "num_steps": np.float32(7.0), "task": np.str_("push")},

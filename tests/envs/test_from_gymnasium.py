@@ -152,12 +152,30 @@ def test_observations_that_have_no_name_or_no_array_are_refused(name):
         from_gymnasium(wrong, cost_keys=["cost"], num_steps=3)
 
 
+def test_a_sum_of_costs_in_info_is_the_cost_and_no_kind_of_its_own():
+    class Summed(Counter):
+        def step(self, action):
+            *values, _ = super().step(action)
+            return *values, {"cost_sum": 3, "cost_a": 1, "cost_b": 2}
+
+    env = from_gymnasium(Summed, num_steps=4, seed=3)
+    assert env.cost_keys == ["cost", "cost_a", "cost_b"]
+    assert env.rollout(1)["next", "cost"].item() == 3
+
+
 def test_costs_of_rows_may_be_of_different_types():
     toll = paying(0, 0.5, np.True_, np.float32(0.25), True, np.int64(2))
     env = from_gymnasium(toll, num_envs=6, num_steps=5, seed=6)
     cost = env.rollout(2)["next", "cost"]
     assert cost[:, 0, 0].tolist() == [0.0, 0.5, 1.0, 0.25, 1.0, 2.0]
     assert torch.equal(cost[:, 0], cost[:, 1])
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_a_reset_may_be_given_what_a_reset_returned(device):
+    env = from_gymnasium(Counter, num_envs=2, num_steps=4, seed=2, device=device)
+    env.reset(env.reset())
+    assert env.rollout(9, break_when_any_done=False)["next", "done"].sum() == 7
 
 
 def test_rows_are_reset_apart():

@@ -70,12 +70,12 @@ def test_steps_are_those_of_the_batched_environment(env_id, name, keys):
         step = step["next"]
         assert (reward, terminated) == (step["reward"].item(), step["terminated"].item())
         assert truncated == step["truncated"].item()
-        total = info.pop("episode_cost", None)
+        total = info.pop("episode_cost")
         assert set(info) == {*batch.cost_keys, "goal_met"} & set(step.keys())
         assert {key: step[key].item() for key in info} == info
         costs.append(info["cost"])
         begun += [info["cost"]]
-        assert total == (sum(begun) if terminated or truncated else None)
+        assert total == sum(begun)
         if terminated or truncated:
             begun = []
             observation, _ = single.reset()

@@ -95,6 +95,8 @@ def test_pictures_are_fitted_in():
     assert columns.tolist() == [2 * int(30 + 9 * place), 2 * int(30 + 9 * place) + 1]
     assert not picture[40:].any()
     assert env.render(width=60, height=20).shape == (2, 20, 60, 3)
+    assert env.render(rows=torch.tensor(1), width=60, height=20).shape == (20, 60, 3)
+    assert env.render(rows=torch.tensor([1]), width=60, height=20).shape == (1, 20, 60, 3)
     with pytest.raises(ValueError, match="no camera 'track'"):
         env.render(camera="track")
 

@@ -1,6 +1,7 @@
 """Keys registered from outside the package: validation, pickling, Hydra, and refused rows."""
 
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
@@ -21,7 +22,6 @@ from safe_rl.envs import (
 )
 from safe_rl.envs.extending import (
     Cost,
-    NextGoal,
     Reading,
     Task,
     register_cost,
@@ -80,8 +80,20 @@ WRONG = {
     "many of a kind": (lambda: register_task("new", Task(max, elements=("vases",))), "'vases_num'"),
     "contacts with nothing": (lambda: cost(max, touches=("pilars",)), "'pilars'.*'pillars'"),
     "a kind without its tuple": (lambda: cost(max, touches="pillars"), r"a text: .*\('pillars',\)"),
+    "flags without a tuple": (
+        lambda: register_cost(Cost("cost_x", ("constrain_x"), max), {"constrain_x": True}),
+        r"a text: .*\('constrain_x',\)",
+    ),
+    "a flag that is no key": (
+        lambda: register_observation(Reading("x", ("observe_con",), max, max)),
+        "no key 'observe_con'.*'observe_com'",
+    ),
+    "a lidar's flag that is no key": (
+        lambda: register_element(replace(MINE, flag="observe_mine"), {"observe_min": False}),
+        "no key 'observe_mine'.*'observe_min'",
+    ),
     "one object": (lambda: register_element(disc("oil", "oil"), {"oil_num": 2}), "only one object"),
-    "no place": (lambda: register_task("a", Task(max, next_goal=NextGoal.BUTTON)), "add 'goal' to"),
+    "no place": (lambda: register_task("a", Task(max, goal_at_button=True)), "add 'goal' to"),
     "a built-in key": (lambda: register_element(MINE, {"num_steps": 3}), "'num_steps'.*taken"),
     "a wrong default": (
         lambda: register_element(MINE, {"mines_num": "a"}),

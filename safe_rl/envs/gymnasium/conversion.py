@@ -10,10 +10,16 @@ from typing import Any
 import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from safe_rl.envs.families import FOREIGN, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, SixValues, make_adapted
+from safe_rl.envs.gymnasium.gymnasium_env import (
+    CostIntoInfo,
+    CostReader,
+    GymnasiumEnv,
+    make_adapted,
+)
 from safe_rl.envs.keys import COST, ConfigError, Count, checked, is_cost
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
@@ -98,7 +104,7 @@ def _batch(
     make_one = partial(make_adapted, make, length, is_vector, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and pickle may refuse them
-    base = GymWrapper(worlds, device=torch.device(device), categorical_action_encoding=True)
+    base = _PartlyReset(worlds, device=torch.device(device), categorical_action_encoding=True)
     entries = list(map(dotted, base.observation_spec.keys(True, True)))
     observed = [name for name in entries if name != privileged]
     base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
@@ -106,6 +112,13 @@ def _batch(
     batch = GymnasiumEnv(base, {**whole, "cost_keys": keys, "privileged": privileged})
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
+
+
+class _PartlyReset(GymWrapper):
+    """TorchRL's wrapper, whose partial resets need a mask, and one on the CPU."""
+
+    def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
+        return kwargs if reset is None else super()._replace_reset(reset.cpu(), kwargs)
 
 
 def from_six_values(
@@ -142,7 +155,7 @@ def from_six_values(
             f"Give a function that makes one environment; num_envs=… makes several. Got {env!r}."
         )
     keys = None if cost_keys is None else [COST, *(key for key in cost_keys if key != COST)]
-    return from_gymnasium(lambda: SixValues(env()), cost_keys=keys, **settings)
+    return from_gymnasium(lambda: CostIntoInfo(env()), cost_keys=keys, **settings)
 
 
 def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
@@ -285,7 +298,7 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
             "package: use from_six_values."
         ) from error
     make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
-    return lambda: SixValues(make())
+    return lambda: CostIntoInfo(make())
 
 
 describe_gymnasium = partial(_describe_node, _registered)

@@ -23,7 +23,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs.gym_like import BaseInfoDictReader
 
 from safe_rl.envs.keys import COST, ConfigError, is_cost
-from safe_rl.envs.pictures import resize
+from safe_rl.envs.pictures import chosen_rows, resize
 from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
@@ -127,6 +127,9 @@ class CheckedSteps(gymnasium.Wrapper):
         if not isinstance(info, dict):
             raise self._wrong("info", "a dictionary", info)
         self._check("observation", self.observation_space, values[0])
+        if COST_SUM in info and COST_SUM not in self._cost_keys:  # no kind of its own
+            info = {COST: info[COST_SUM], **info}
+            del info[COST_SUM]
         costs = {key: self._number(f"info['{key}']", info[key]) for key in self._costs_of(info)}
         for name, end in zip(("terminated", "truncated"), values[2:], strict=True):
             if not isinstance(end, bool | np.bool_ | int | np.integer):
@@ -200,7 +203,7 @@ class CheckedSteps(gymnasium.Wrapper):
         )
 
 
-class SixValues(gymnasium.Wrapper):
+class CostIntoInfo(gymnasium.Wrapper):
     """An environment whose step returns (observation, reward, cost, terminated, truncated, info).
 
     The wrapper's step returns Gymnasium's five values, with the cost in `info`.
@@ -216,8 +219,7 @@ class SixValues(gymnasium.Wrapper):
                 "values and has the cost in info, use env=gymnasium."
             )
         observation, reward, cost, terminated, truncated, info = values
-        others = {key: value for key, value in info.items() if key != COST_SUM}
-        return observation, reward, terminated, truncated, {**others, COST: float(cost)}
+        return observation, reward, terminated, truncated, {**info, COST: float(cost)}
 
 
 class CostReader(BaseInfoDictReader):
@@ -295,9 +297,9 @@ class GymnasiumEnv(TorchRLEnv):
         frames = self.base_env._env.render()
         if frames is None or frames[0] is None:
             raise ValueError("The environment draws no frames: set env.render_mode=rgb_array.")
-        chosen = range(len(frames)) if rows is None else [rows] if isinstance(rows, int) else rows
+        chosen, is_one = chosen_rows(rows, len(frames))
         drawn = np.stack([_fit(np.asarray(frames[row]), width, height) for row in chosen])
-        return drawn[0] if isinstance(rows, int) else drawn
+        return drawn[0] if is_one else drawn
 
 
 def _fit(picture: np.ndarray, width: int, height: int) -> np.ndarray:

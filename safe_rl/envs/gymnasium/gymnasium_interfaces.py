@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from safe_rl.envs.gymnasium.world_arrays import (
-    EPISODE_COST,
     RENDER_MODES,
     Config,
     Observation,
@@ -51,7 +50,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         >>> _, _ = env.reset(seed=0)
         >>> _, reward, terminated, truncated, info = env.step(env.action_space.sample())
         >>> sorted(info)
-        ['cost', 'cost_exception', 'cost_hazards', 'goal_met']
+        ['cost', 'cost_exception', 'cost_hazards', 'episode_cost', 'goal_met']
     """
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012
@@ -73,8 +72,6 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         """Take one action [nu]."""
         observation, values, infos = self._step(np.asarray(action)[None])
         reward, terminated, truncated = (value[0].item() for value in values)
-        if terminated or truncated:
-            infos[EPISODE_COST] = self._episode_cost.copy()
         # TorchRL reads only what has a dtype from an info, and Gymnasium batches only numbers and
         # arrays of NumPy; its booleans are not among these, so an event is an array without axes.
         info = {
@@ -183,20 +180,17 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
                 "reset(options={'reset_mask': terminations | truncations}) before the next step."
             )
         observation, (reward, terminated, truncated), infos = self._step(actions)
-        total = {EPISODE_COST: self._episode_cost}
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
         # Environments that start an episode in this step.
         begins = terminated | truncated if within else self._ended
         reported = with_masks(infos, ~begins)
         if within:
-            reported |= final_infos(observation, infos | total | self._positions(), begins)
+            reported |= final_infos(observation, infos | self._positions(), begins)
         else:
             # the step of an environment that had already ended does not count
             reward = np.where(begins, 0.0, reward)
             terminated, truncated = terminated & ~begins, truncated & ~begins
             self._ended = terminated | truncated
-            if self._ended.any():
-                reported |= with_masks(total, self._ended)
         if begins.any():
             observation = choose(begins, self._reset(begins), observation)
         # Where an episode begins, the positions are those of the new episode.

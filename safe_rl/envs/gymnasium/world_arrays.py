@@ -24,10 +24,11 @@ from safe_rl.envs.velocity.velocity_config import (
     VELOCITY_SUITE,
     VelocityConfig,
     resolve_velocity,
+    velocity_name,
 )
 from safe_rl.envs.velocity.velocity_env import VelocityEnv
 
-EPISODE_COST = "episode_cost"  # the sum over an episode, in the info of its last step
+EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
 NUM_SEEDS = 2**62
 RENDER_MODES = ["rgb_array"]
 
@@ -133,6 +134,8 @@ class Worlds:
         infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
         infos |= {key: column[key] for key in self.batch.events}
         self._episode_cost += infos[COST]
+        # at every step, because wrappers such as `TimeLimit` may end the episode after any of them
+        infos[EPISODE_COST] = self._episode_cost.copy()
         values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
         return arrays_of(step["observation"]), values, infos
 
@@ -154,7 +157,7 @@ def batch_of(
         raise ConfigError(f"config='{config}' is a name: give keys, as make_env('{config}').config")
     base: Any = SafetyGymConfig()
     if name is not None:
-        base = resolve_velocity(name) if name in VELOCITY_SUITE else resolve(name)
+        base = resolve_velocity(name) if velocity_name(name) in VELOCITY_SUITE else resolve(name)
     if config is None or isinstance(config, Mapping):
         whole = base.replace(**(config or {}))
     elif isinstance(config, type(base)):

@@ -107,7 +107,7 @@ COSTS: list[Cost] = [
          excess_speed(w.robot_vel, c.velocity_limit)),
 ]  # fmt: skip
 EXCEPTION_KEY = "cost_exception"
-BUILT_IN = frozenset(row.key for row in COSTS)
+BUILT_IN_COSTS = frozenset(row.key for row in COSTS)
 
 
 def active_costs(config: SafetyGymConfig) -> list[Cost]:
@@ -129,7 +129,7 @@ def compute_costs(rows: Sequence[Cost], world: World, failed: Tensor) -> Tensor:
         magnitudes = [magnitude.masked_fill(failed, 0.0) for magnitude in magnitudes]
     exceptions = failed.to(world.physics.dtype)  # determines the dtype of the sum
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
-    if any(row.key not in BUILT_IN for row in rows):
+    if any(row.key not in BUILT_IN_COSTS for row in rows):
         # NaN would be 0 after `gt_`, and infinity 1
         world.physics.check(~_allowed(costs), partial(_wrong_cost, rows, costs.clone()))
     return costs.gt_(0.0) if config.constrain_indicator else costs

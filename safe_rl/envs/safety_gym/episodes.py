@@ -36,7 +36,7 @@ class Purpose(IntEnum):
     GOAL = 3
     NOISE = 4
     FRAMESKIP = 5
-    SPLIT = 6
+    LAYOUT_SEED = 6
     FIRST_GOAL = -1  # differs from all step numbers, which are in the same place of a key
 
 
@@ -168,8 +168,8 @@ def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
     evaluations on the same set, have the same layouts.
     """
     assert config.layout_seeds is not None
-    index = (rng.uniform(key, Purpose.SPLIT) * config.layout_seeds).to(torch.int64)
-    return rng.fold(config.layout_seeds_first + index, Purpose.SPLIT)
+    index = (rng.uniform(key, Purpose.LAYOUT_SEED) * config.layout_seeds).to(torch.int64)
+    return rng.fold(config.layout_seeds_first + index, Purpose.LAYOUT_SEED)
 
 
 def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:

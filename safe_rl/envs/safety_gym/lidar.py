@@ -174,8 +174,9 @@ def _natural(
 ) -> Callable[[World], Tensor]:
     """Return a function that casts rays, each at one geom group: exp(-distance), 0 for a miss.
 
-    Two peculiarities of the benchmark are kept: the floor and the robot's limbs have the goal's
-    group; groups beyond MuJoCo's six (the circle's) are never seen.
+    Peculiarities of the benchmark are kept: the floor and the robot's limbs have the goal's group;
+    groups beyond MuJoCo's six (the circle's) are never seen; rays pass above hazards;
+    `lidar_max_dist`, `lidar_exp_gain` and `lidar_alias` have no effect.
     """
     rays = ray_directions(scene.config.lidar_num_bins).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))

@@ -207,8 +207,10 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
     for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
         pinned, number = len(keys.get(f"{kind}_locations", ())), keys.get(f"{kind}_num", 1)
         if pinned > number:
-            raise ConfigError(
-                f"'{kind}_locations' has {pinned} locations for {number} objects: change either."
+            warnings.warn(
+                f"'{kind}_locations' has {pinned} locations for {number} objects: the last ones "
+                "have no effect.",
+                stacklevel=2,
             )
         if keys.get(f"constrain_{kind}") and not number:
             warnings.warn(

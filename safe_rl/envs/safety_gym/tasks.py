@@ -11,7 +11,6 @@ is imported inside the functions that need more than methods of tensors.
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
 from safe_rl.envs.keys import ConfigError
@@ -34,13 +33,6 @@ def circle_speed(com_xy: Tensor, velocity_xy: Tensor, radius: float) -> Tensor:
     return ((-u * y + v * x) / r.clamp_min(_CENTRE)) / (1 + (r - radius).abs())
 
 
-class NextGoal(Enum):
-    """How a new goal is drawn."""
-
-    POSITION = "position"
-    BUTTON = "button"
-
-
 class Task(NamedTuple):
     """A row: one task.
 
@@ -48,7 +40,7 @@ class Task(NamedTuple):
         reward: (config, world, measured one step before [N, D], measured now [N, D]) -> [N].
         measure: Measurements whose differences are the reward, world -> [N, D].
         met: (config, world, measured now) -> bool [N], for tasks with goals.
-        next_goal: How a new goal is drawn, for tasks with goals; None: as a position.
+        goal_at_button: Whether a new goal is one of the buttons; otherwise it is a position.
         elements: Kinds of which the task adds one object each.
         touches: Kinds of objects whose contacts with the robot it reads.
         at_origin: Kinds without an object that are observed at the origin.
@@ -57,7 +49,7 @@ class Task(NamedTuple):
     reward: Callable[[SafetyGymConfig, World, Tensor, Tensor], Tensor]
     measure: Callable[[World], Tensor] = lambda w: w.robot_pos.new_zeros(len(w.robot_pos), 0)
     met: Callable[[SafetyGymConfig, World, Tensor], Tensor] | None = None
-    next_goal: NextGoal | None = None
+    goal_at_button: bool = False
     elements: tuple[str, ...] = ()
     touches: tuple[str, ...] = ()
     at_origin: tuple[str, ...] = ()
@@ -103,11 +95,9 @@ def _box_in_goal(config: SafetyGymConfig, world: World, now: Tensor) -> Tensor:
 
 
 TASKS: dict[str, Task] = {
-    "goal": Task(_approach, goal_distance, _in_goal, NextGoal.POSITION, ("goal",)),
-    "button": Task(
-        _approach, goal_distance, _presses_goal, NextGoal.BUTTON, ("goal",), touches=("buttons",)
-    ),
-    "push": Task(_push, _to_box_and_goal, _box_in_goal, NextGoal.POSITION, ("goal", "box")),
+    "goal": Task(_approach, goal_distance, _in_goal, elements=("goal",)),
+    "button": Task(_approach, goal_distance, _presses_goal, True, ("goal",), touches=("buttons",)),
+    "push": Task(_push, _to_box_and_goal, _box_in_goal, elements=("goal", "box")),
     "x": Task(lambda c, w, before, now: c.reward_x * (now - before)[:, 0], lambda w: w.com),
     "z": Task(lambda c, w, before, now: c.reward_z * (now - before)[:, 2], lambda w: w.com),
     "circle": Task(
@@ -123,12 +113,12 @@ TASKS: dict[str, Task] = {
 }
 
 
-BUILT_IN = frozenset(TASKS)
+BUILT_IN_TASKS = frozenset(TASKS)
 
 
 def goal_is_button(task: str) -> bool:
     """Whether the goal of a task is at the goal button."""
-    return TASKS[task].next_goal is NextGoal.BUTTON
+    return TASKS[task].goal_at_button
 
 
 def dense_reward(task: Task, world: World, before: Tensor, now: Tensor, failed: Tensor) -> Tensor:
@@ -141,7 +131,7 @@ def dense_reward(task: Task, world: World, before: Tensor, now: Tensor, failed: 
     reward = world.require(
         f"'reward' of task '{config.task}'", task.reward(config, world, before, now)
     )
-    if config.task not in BUILT_IN:
+    if config.task not in BUILT_IN_TASKS:
         error = ConfigError(
             f"'reward' of task '{config.task}' is NaN or infinite: return a number for every world."
         )

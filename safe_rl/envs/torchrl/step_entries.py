@@ -167,15 +167,10 @@ class Observe(Transform):
 
     def __init__(self, env: EnvBase, config: Mapping[str, Any]) -> None:
         super().__init__()
-        self._privileged = config.get("privileged")
-        self._specs = _choose_entries(env.observation_spec, config["observe"], self._privileged)
-        hidden = (
-            {}
-            if self._privileged is None
-            else {self._privileged: env.observation_spec[entry_key(self._privileged)]}
-        )
-        self.privileged_layout = add_columns({}, {n: _size(s) for n, s in hidden.items()})
-        self._hidden = hidden
+        name, spec = config.get("privileged"), env.observation_spec
+        self._specs = _choose_entries(spec, config["observe"], name)
+        self._privileged = {} if name is None else {name: spec[entry_key(name)]}
+        self.privileged_layout = add_columns({}, {n: _size(s) for n, s in self._privileged.items()})
         self._flatten = config["flatten"] and len(self._specs) > 1
         pictures = [name for name, spec in self._specs.items() if _is_picture(spec)]
         if self._flatten and pictures:
@@ -185,7 +180,7 @@ class Observe(Transform):
             )
         # what the environment needs for its next step stays where it is
         needed = {*map(dotted, env.state_spec.keys(True, True)), _OBSERVATION}
-        self._moved = [entry_key(n) for n in (*self._specs, *hidden) if n not in needed]
+        self._moved = [entry_key(n) for n in (*self._specs, *self._privileged) if n not in needed]
         last = [name.rpartition(".")[2] for name in self._specs]
         self._names = {
             name: name.replace(".", "_") if last.count(end) > 1 else end
@@ -199,7 +194,7 @@ class Observe(Transform):
             for name, spec in self._specs.items()
         }
         after = next_tensordict.exclude(*self._moved)
-        for name, spec in self._hidden.items():
+        for name, spec in self._privileged.items():
             after.set(_PRIVILEGED, _numbers(next_tensordict[entry_key(name)], spec))
         if self._flatten:
             return after.set(_OBSERVATION, torch.cat(list(values.values()), -1))
@@ -224,7 +219,7 @@ class Observe(Transform):
         for key in self._moved:
             if key in observation_spec.keys(True):
                 del observation_spec[key]
-        for spec in self._hidden.values():
+        for spec in self._privileged.values():
             observation_spec[_PRIVILEGED] = Unbounded((*shape, _size(spec)), device=device)
         if self._flatten:
             size = sum(map(_size, self._specs.values()))

@@ -8,7 +8,6 @@ from safe_rl.envs.transforms.environment import (
 )
 from safe_rl.envs.transforms.observation_transforms import (
     ObservedCosts,
-    PolicyMemory,
     RecurrentState,
     SensorNoise,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "ConstraintTransform",
     "EarlyTermination",
     "ObservedCosts",
-    "PolicyMemory",
     "RecurrentState",
     "Saute",
     "SensorNoise",

@@ -198,9 +198,11 @@ class ActionRepeat(ConstraintTransform):
             active = ~result.get("done")
             if not active.any():
                 break
-            # A stateless environment reads its state from the last step. Others may refuse steps
-            # after an end, so rows that have ended begin an episode whose steps are not counted.
-            state = env.maybe_reset(tensordict.clone(False).update(result))
+            # A stateless environment reads its state from the last step.
+            state = tensordict.clone(False).update(result)
+            if not getattr(env, "steps_after_end", False):
+                # so rows that have ended begin an episode whose steps are not counted
+                state = env.maybe_reset(state)
             after = env._step(state.set("action", tensordict.get("action")))
             after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
             after.update({key: result.get(key) | after.get(key) for key in events})

@@ -156,6 +156,7 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self.cost_keys = list(base_env.cost_keys)
         self.return_key = base_env.return_key
         self.reuses_tensors = base_env.reuses_tensors
+        self.steps_after_end = base_env.steps_after_end
         self.privileged_layout = base_env.privileged_layout
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours.items():

@@ -194,9 +194,6 @@ class RecurrentState(ConstraintTransform):
         return observation_spec
 
 
-PolicyMemory = RecurrentState  # its name in the configurations of earlier runs
-
-
 LAST, TRACE = "last_costs", "cost_traces"
 
 

@@ -74,7 +74,7 @@ class EarlyTermination(ConstraintTransform):
         over = (spent > allowed).any(-1, keepdim=True)
         for key in ("done", "terminated"):
             next_tensordict.set(key, next_tensordict.get(key) | over)
-        # an end is never both, because algorithms do not agree on what both would mean
+        # one cause per end, as in the simulated environments; algorithms read only `terminated`
         next_tensordict.set("truncated", next_tensordict.get("truncated") & ~over)
         return next_tensordict
 

@@ -208,12 +208,23 @@ VELOCITY_SUITE: dict[str, dict[str, Any]] = {
 }
 
 
+def velocity_name(name: str) -> str:
+    """Return the name in `VELOCITY_SUITE` for a name or id, also one of Safety-Gymnasium.
+
+    Examples:
+        >>> velocity_name("SafetyHopperVelocity-v1"), velocity_name("SafeHopperVelocity-v0")
+        ('SafeHopperVelocity', 'SafeHopperVelocity')
+    """
+    plain = name.removesuffix("-v0").removesuffix("-v1")
+    return f"Safe{plain.removeprefix('Safety')}" if plain.startswith("Safety") else plain
+
+
 def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityConfig:
     """Return the configuration of a name, a mapping of keys, or a configuration.
 
     Args:
-        env: "SafeHopperVelocity", Safety-Gymnasium's "SafetyHopperVelocity-v1", a mapping with
-            `robot` and any of its keys, or a `VelocityConfig`.
+        env: A name or id as of `velocity_name`, a mapping with `robot` and any of its keys, or a
+            `VelocityConfig`.
 
     Raises:
         ConfigError: For an unknown name (the nearest one is named), or an invalid configuration.
@@ -222,9 +233,7 @@ def resolve_velocity(env: str | Mapping[str, Any] | VelocityConfig) -> VelocityC
         return env
     if not isinstance(env, str):
         return VelocityConfig.from_dict(env)
-    name = env.removesuffix("-v1")
-    if name.startswith("Safety"):
-        name = f"Safe{name.removeprefix('Safety')}"
+    name = velocity_name(env)
     if name not in VELOCITY_SUITE:
         raise ConfigError(
             f"Unknown environment '{env}'.{did_you_mean(name, VELOCITY_SUITE)} The velocity family "
