@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from typing import Any
 
 STEPS_TAKEN = "steps_taken"
@@ -44,19 +44,15 @@ def nearest(name: str, known: Iterable[str], likeness: float = _LIKENESS) -> str
         True
     """
     wanted = _plain(name)
+    names = {_plain(candidate): candidate for candidate in known}
 
-    def rank(candidate: str) -> tuple[bool, bool, float, bool, bool, int]:
-        there = _plain(candidate)
-        ratio = round(SequenceMatcher(None, there, wanted).ratio(), 6)
+    def rank(there: str) -> tuple[bool, bool]:
         # ppo_lagrangian begins with PPOLag
         begins = there.replace("_", "").startswith(wanted.replace("_", ""))
-        has_beginning = begins and len(name) >= _BEGINNING
-        is_within, is_mixed = there in wanted, sorted(there) == sorted(wanted)
-        length = -abs(len(candidate) - len(name))
-        return ratio >= likeness, has_beginning, ratio, is_within, is_mixed, length
+        return begins and len(name) >= _BEGINNING, sorted(there) == sorted(wanted)
 
-    best = max(known, key=rank, default=None)
-    return best if best is not None and rank(best)[0] else None
+    close = get_close_matches(wanted, names, len(names) or 1, likeness)  # the most similar first
+    return names[max(close, key=rank)] if close else None
 
 
 def _plain(name: str) -> str:

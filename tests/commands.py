@@ -1,12 +1,12 @@
 """The command train.py in this process, and any program in one of its own."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig
@@ -34,18 +34,15 @@ def status_of(*arguments: str) -> object:
 
 def composed(*words: str) -> list[DictConfig]:
     """The checked configurations that a command line begins runs with, at most four of a sweep."""
-    words = re.sub(
-        r"(--c(?:onfig-dir|onfig-name|fg))\n", r"\1=", "\n".join(train.prepare(words))
-    ).split("\n")
-    folders = [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
-    names = [word.partition("=")[2] for word in words if word.startswith("--config-name=")]
-    words = [word for word in words if not word.startswith("-")]
+    given = get_args_parser().parse_args(train.prepare(words))
+    folders = [given.config_dir] if given.config_dir else []
+    name = given.config_name or "config"
     try:
-        overrides = OverridesParser.create().parse_overrides(words)
+        overrides = OverridesParser.create().parse_overrides(given.overrides)
         jobs = BasicSweeper.split_arguments(overrides, None)[0]
     except HydraException:
-        jobs = [words]
-    configs = [compose_run(job, folders, *names) for job in jobs[:2] + jobs[2:][-2:]]
+        jobs = [given.overrides]
+    configs = [compose_run(job, folders, name) for job in jobs[:2] + jobs[2:][-2:]]
     for config in configs:
         check_settings(config)
     return configs

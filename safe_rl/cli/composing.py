@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.config import General, keys_of, unknown_key
+from safe_rl.cli.folders import env_name
 from safe_rl.cli.options import first_line, unreadable
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import env_names, hint_of_gymnasium
@@ -41,6 +42,10 @@ from safe_rl.trust import check_imports
 _MOST_LISTED = 40
 RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
+COMPOSITION_ERRORS = (
+    *(HydraException, OmegaConfBaseException, YAMLError),
+    *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
+)
 
 
 def compose_run(
@@ -69,8 +74,9 @@ def compose_run(
     words = [*overrides_of({"hydra.searchpath": paths} if paths else {}), *words]
     try:
         config = _compose(words, name)
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise ValueError(explain(error, words)) from error
+    except COMPOSITION_ERRORS as error:
+        given = [f"--config-name={name}", *words]
+        raise ValueError(explain(error, given)) from error
     name_choices(config, config.hydra)
     return config
 
@@ -107,9 +113,8 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
     name, chosen = config.env.name, choices.get("env")
     if chosen is None or name == chosen or name not in env_names():
         return
-    if chosen not in env_names():  # a file of the user's that builds on one of the package
-        config.env.name = chosen
-    else:
+    config.env.name = env_name(name, chosen)
+    if config.env.name == name:
         raise ValueError(
             f"env.name={name} would train env={chosen} under the name of another environment. To "
             f"choose that one, write env={name}."
@@ -148,11 +153,22 @@ def _written(value: Any) -> str:
 
 
 def explain(error: Exception, words: Sequence[str]) -> str:
-    """What is wrong with a command, in one line that names the nearest right word."""
+    """What is wrong with a command, in one line that names the nearest right word.
+
+    Raises:
+        AttributeError: The error, if it is one that no word explains.
+    """
     if isinstance(error, OverrideParseException):
         return unreadable(str(error.override), error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _unknown_choice(error)
+    if str(error).startswith("Config group override must be"):
+        return _unnamed_choice(words) or str(error)
+    if type(error) is AttributeError:
+        missing = re.search(r"full_key: (\w+)\.\S+\s+object_type=General", str(error))
+        if missing is None:
+            raise error
+        return _absent(missing[1])
     unknown = re.match(r"Could not override '([^']+)'\.", str(error))
     if isinstance(error, ConfigCompositionException) and unknown:
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
@@ -163,7 +179,7 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
     absent = re.match(r"Missing mandatory value: (\S+)", str(cause or error))
     if absent and absent[1] in General.__annotations__:
-        return f"this algorithm has no '{absent[1]}'."
+        return _absent(absent[1])
     if cause is not None and str(error) != str(cause):
         return f"{first_line(error)}: {first_line(cause)}"
     missing = re.match(r"Missing mandatory value: (\S+)", str(error))
@@ -185,21 +201,48 @@ def _unknown_choice(error: MissingConfigException) -> str:
     all_of_them = f"There are {', '.join(known)}"
     listed = all_of_them if len(known) <= _MOST_LISTED else f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
-    hint = hint or did_you_mean(name, known, 0.6)
+    hint = hint or did_you_mean("none" if name == "null" else name, known, 0.6)
     more = f" {listed}; a file of yours needs --config-dir FOLDER."
     return f"{place}there is no {group} '{name}'.{hint or more}"
 
 
+def _unnamed_choice(words: Sequence[str]) -> str | None:
+    """A message about a choice that is no name, such as ``logger=null``."""
+    for key, value in re.findall(r"^(\w+)=(null|true|false|[\d.]+)$", "\n".join(words), re.M):
+        try:
+            _compose([f"{key}='{value}'"])
+        except MissingConfigException as error:  # it knows the names
+            return _unknown_choice(error).rpartition(".yaml: ")[2]
+        except COMPOSITION_ERRORS:  # no choice but a value, such as seed=3
+            continue
+    return None
+
+
+def _absent(section: str) -> str:
+    """A message about a section that the algorithm's file does not have."""
+    if section == "evaluation":
+        return "evaluation: give both keys at once, evaluation='{interval: 10000, episodes: 5}'."
+    return f"this algorithm has no '{section}'."
+
+
 def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     """A message about a key that the configuration does not have."""
-    others = [word for word in words if not word.lstrip("+~").startswith((f"{given}=", f"{key}="))]
+    name = RESUMED if f"--config-name={RESUMED}" in words else "config"
+    if name == RESUMED and (key == "env" or (CONF / key).is_dir()):
+        return f"{key}: a continued run keeps its {key}."
+    if key.startswith("cost_limits."):
+        example = f"{{{key.partition('.')[2]}: 10}}"
+        return f"{key}: limits are given together, cost_limits='{example}'."
+    wrong = ("-", f"{given}=", f"{key}=")
+    settings = (word for word in words if "=" in word)
+    others = [word for word in settings if not word.lstrip("+~").startswith(wrong)]
     try:
-        config = _compose(others)
+        config = _compose(others, name)
     except (HydraException, OmegaConfBaseException):
         return unknown_key(key, [])
     section = key.partition(".")[0]
     if OmegaConf.is_missing(config, section):
-        return f"this algorithm has no '{section}'."
+        return _absent(section)
     return unknown_key(key, keys_of(config))
 
 
@@ -236,9 +279,11 @@ def read_resumed(
     _refuse_foreign_cluster(config, words, directory)
     if modules is not None:
         config["import"] = list(modules)
+    if any(re.match(r"logger=\w", word) for word in words):
+        config.pop("logger", None)  # keys of another logger would stay
     place = str(directory).replace("${", "\\${")
     return {
-        "defaults": ["_self_", {"override hydra/job_logging": "stdout"}],
+        "defaults": ["_self_", {"logger": None}, {"override hydra/job_logging": "stdout"}],
         "hydra": {"run": {"dir": place}, "output_subdir": None},
         **config,
     }

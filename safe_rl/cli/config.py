@@ -213,6 +213,11 @@ def check_settings(config: DictConfig) -> None:
         _check(General, config, "")
         _check(Algo, config.algo, "algo", is_open=True)
         _check(CertificateOptions, config.certificate, "certificate")
+        for name in {"tail", "deterministic"} & {*config.certificate}:
+            raise SettingError(
+                f"certificate.{name}: leave it out. The tail is the risk's (risk=cvar "
+                "risk.tail=…), and a run is certified with sampled actions."
+            )
         if not OmegaConf.is_dict(config.model) or "_target_" not in config.model:
             _check(Model, config.model, "model")
         check_value("env.name", Folder, config.env.name)

@@ -125,6 +125,8 @@ def _hint_of_grammar(text: str) -> str:
         return " Put values with spaces in quotes: cost_limits='{cost: 10}'."
     if re.search(r"[^\x20-\x7e]|[ \[\](){}$,]", text.partition("=")[2]):
         key, _, value = text.partition("=")
+        if value[:1] in ("{", "["):
+            return " Within it, texts with such characters need quotes: \"labels={a: 'A (b)'}\"."
         return f" A text with such characters needs quotes within quotes: \"{key}='{value}'\"."
     return ""
 

@@ -146,6 +146,7 @@ def resume(
     ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
     config = compose_run(words, name=RESUMED)
     refuse_changes(folder.absolute(), config)
+    check_settings(config)
     return _carry_out(config, folder, callbacks, continues=True)
 
 

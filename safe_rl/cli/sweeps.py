@@ -26,7 +26,7 @@ from safe_rl.cli.config import check_settings
 from safe_rl.files import replace_text
 from safe_rl.runs.figures import violation
 from safe_rl.runs.folder import RunInUseError
-from safe_rl.runs.identity import differences
+from safe_rl.runs.identity import differences, is_to_keep_limits
 from safe_rl.runs.progress_bar import LINE_SECONDS
 from safe_rl.runs.run import Run
 from safe_rl.trust import import_modules
@@ -84,7 +84,8 @@ def run_job(config: DictConfig, settings: HydraConf, run: Run) -> float:
         complete(config, run)
         check_same_run(config, run)
     train(config, run.directory, hydra=settings, continues=True)
-    figures, limits = run.final, run.cost_limits
+    # without an algorithm that keeps them, costs are only recorded
+    figures, limits = run.final, run.cost_limits if is_to_keep_limits(config) else {}
     value = figures["episode_return"]
     is_above = any(violation(figures, key, limit) > 0 for key, limit in limits.items())
     return -math.inf if is_above or math.isnan(value) else value

@@ -7,6 +7,7 @@ training are imported when a run begins, so that help and errors appear at once.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,13 +17,13 @@ from typing import Any
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
+from safe_rl.checks import UNEXPECTED
 from safe_rl.cli.composing import (
+    COMPOSITION_ERRORS,
     RESUMED,
     explain,
     name_choices,
@@ -56,8 +57,9 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
     try:
         sys.argv = [sys.argv[0], *prepare(sys.argv[1:] if words is None else words)]
         main()
-    except (HydraException, OmegaConfBaseException, YAMLError, ValueError, OSError) as error:
-        if before[1] == "1":  # the user wants to see the traceback
+    except (*COMPOSITION_ERRORS, OSError) as error:
+        # the user wants to see the traceback, or has to
+        if before[1] == "1" or UNEXPECTED in getattr(error, "__notes__", ()):
             raise
         sys.exit(printable(explain(error, sys.argv[1:])))
     except KeyboardInterrupt:
@@ -80,10 +82,12 @@ def prepare(words: Sequence[str]) -> list[str]:
         ValueError: If a module, a slate or a run cannot be used.
 
     Examples:
-        >>> prepare(["slate=SGPoint", "-m", "seed=0"])
-        ['-m', 'seed=0', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2']
+        >>> prepare(["-m", "slate=SGPoint", "seed=0"])
+        ['-m', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0']
     """  # noqa: E501
     store_configs(_shown(words))
+    ours = (i for i, word in enumerate(words) if re.match(r"\+*(import|slate)=", word))
+    place = next(ours, 0)
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)
@@ -92,14 +96,16 @@ def prepare(words: Sequence[str]) -> list[str]:
         directory = Path(runs[-1]).expanduser().absolute()
         ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, words))
         return [f"--config-name={RESUMED}", *words]
+    new = [] if modules is None else [*overrides_of({"import": modules})]
     for name in slates:
         if name not in SLATES:
             raise ValueError(
                 f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "
                 f"Slates are: {', '.join(SLATES)}."
             )
-        words.append(f"env={','.join(SLATES[name])}")
-    return [*words, *(overrides_of({"import": modules}) if modules is not None else ())]
+        new.append(f"env={','.join(SLATES[name])}")
+    # Hydra's parser of flags takes overrides only where they stand together
+    return [*words[:place], *new, *words[place:]]
 
 
 def _shown(words: Sequence[str]) -> list[str] | None:

@@ -63,7 +63,7 @@ class ReportOptions(CheckedOptions):
     formats: Annotated[str, _FORMATS] = option("png", "of the pictures, such as png,svg,pdf")
     width: Annotated[float, Interval(ge=2, le=40)] = option(figures.WIDTH, "of the pictures [inch]")
     panels: bool = option(False, "write every panel of a picture to a file of its own, too")
-    labels: dict[str, str] = option(dict, "names to show, such as '{cpo: CPO (ours)}'")
+    labels: dict[str, str] = option(dict, "names to show, such as \"{cpo: 'CPO (ours)'}\"")
     columns: str | None = option(None, "columns of tables.tex, such as algorithm,J_r,J_c")
 
 

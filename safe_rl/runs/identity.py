@@ -37,8 +37,7 @@ class Role(Enum):
     MANNER = ("how a run is carried out: names nothing, and stays", 0, 0, 0)
     MACHINE = ("belongs to the machine", 0, 1, 1)
 
-    def __init__(self, meaning: str, *flags: int) -> None:
-        self.meaning = meaning
+    def __init__(self, _meaning: str, *flags: int) -> None:
         self.names_experiment, self.may_change, self.may_differ = map(bool, flags)
 
 
@@ -79,10 +78,6 @@ ROLES: dict[str, Role] = {
     "logger": Role.MACHINE,
     "num_threads": Role.MACHINE,
     "record": Role.MACHINE,  # which files of a run are kept
-    "hydra": Role.MACHINE,
-    "hydra.output_subdir": Role.MANNER,
-    "hydra.run": Role.MANNER,
-    "hydra.sweep": Role.MANNER,
 }
 """Key -> its role and that of all keys below it; ``*.name`` is any key that ends in ``.name``.
 

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.checks import SettingError
+from safe_rl.checks import UNEXPECTED, SettingError
 from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.loading import keep_robot, node_of
@@ -42,13 +42,12 @@ _WHILE_TRAINING = (
     *(OSError, TableError, ConfigError, ContractError, EpisodeError, FloatingPointError),
     *(SettingError, WorkerError, MemoryError),
 )
-_UNEXPECTED = "This happened during training, not because of a setting."
 
 
 def is_expected(error: Exception) -> bool:
     """Whether an error is about settings, files or the environment: the message is enough."""
     is_known = isinstance(error, SETTING_ERRORS + _WHILE_TRAINING)
-    return is_known and _UNEXPECTED not in getattr(error, "__notes__", ())
+    return is_known and UNEXPECTED not in getattr(error, "__notes__", ())
 
 
 @torch.enable_grad()  # a notebook may have turned gradients off
@@ -163,7 +162,7 @@ def _during_training() -> Iterator[None]:
         yield
     except Exception as error:
         if not isinstance(error, _WHILE_TRAINING):
-            error.add_note(_UNEXPECTED)
+            error.add_note(UNEXPECTED)
         raise
 
 

@@ -14,6 +14,9 @@ RIGHT = [
     ["algo=paper/cpo", "policy_update.target_kl=0.02"],
     ["-m", "algo=ppo,trpo,cup", "preset=gpu"],
     ["-m", "algo=sac,sac_lagrangian", "preset=hard_tasks"],
+    ["import=json", "algo=cpo", "--cfg", "job"],
+    ["slate=SGPoint", "seed=0", "algo=cpo", "-m"],
+    ["-m", "import=json", "seed=0,1", "--config-dir", "conf"],
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
@@ -30,11 +33,18 @@ WRONG = {
     "env={name: CarGoal1}": "would train env=PointGoal1 under the name of .*write env=CarGoal1",
     "preset=paper": "write algo=paper/cpo",
     "preset=hard_tasks": "^preset=hard_tasks: algo=ppo_lagrangian has no 'memory'",
+    "logger=null": r"no logger 'null'\. Did you mean 'none'\?$",
+    "lagrangian=null": r"^there is no lagrangian 'null'\. There are adam, pi, pid",
+    "+evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
+    "evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
+    "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
+    "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
     "slate=SG7": "Unknown slate 'SG7'",
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
     "PointGoal1": r"cannot be read.* written key=value, such as env=PointGoal1\.$",
+    "note={a: A (b)}": r"cannot be read.* need quotes: \"labels={a: 'A \(b\)'}\"\.$",
     "init_from=my run (1)": r"cannot be read.*quotes: \"init_from='my run \(1\)'\"\.$",
 }
 MINE = """
@@ -114,6 +124,8 @@ def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
     folder = f"{flag}{tmp_path}{']' if '[' in flag else ''}"
     (config,) = composed(folder, "algo=mine", "env=Nearby", "algo.tail=0.1")
     assert (config.algo.name, config.env.hazards_num, config.lagrangian.init) == ("mine", 3, 0.1)
+    assert config.hydra.run.dir.startswith("runs/Nearby/mine/")
+    assert config.hydra.sweep.subdir.startswith("Nearby/mine/")
     for wrong, meant in {
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",

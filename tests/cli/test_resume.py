@@ -52,7 +52,7 @@ def test_folders_may_have_any_name(tmp_path, name):
 )
 def test_what_is_not_marked_as_changing_stays(run, override):
     with pytest.raises(
-        ValueError, match=r"cannot change|no key|in its folder|=CarGoal1|=process|reach only"
+        ValueError, match=r"cannot change|no key|in its folder|keeps its (env|collector)|reach only"
     ):
         resumed(run, override)
 
@@ -68,6 +68,10 @@ def test_what_is_not_marked_as_changing_stays(run, override):
 def test_what_is_marked_may_change(run, key, value):
     config = resumed(run, f"{key}={value}".lower(), "hydra.verbose=true")
     assert OmegaConf.select(config, key) == value
+
+
+def test_another_logger_leaves_no_keys_of_the_first(run):
+    assert resumed(run, "logger=none").logger == {"_target_": None}
 
 
 def test_only_a_run_can_be_resumed(run):

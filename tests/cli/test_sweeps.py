@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from commands import ROOT, SMALL, composed, in_a_process
@@ -15,7 +16,7 @@ from hydra.core.utils import JobReturn
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from safe_rl.cli.sweeps import Summary, run_in_sweep
+from safe_rl.cli.sweeps import Summary, run_in_sweep, run_job
 from safe_rl.runs.checkpoints import read_facts
 from safe_rl.runs.figures import final_figures
 from safe_rl.runs.progress_bar import LINE_SECONDS, ProgressBar
@@ -101,6 +102,7 @@ def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
         ([], "."),
         (["num_threads=2", "logger=none", "record=true", "certificate.episodes=0"], "."),
         (["env.hazards_num=1", "import=json"], "env.hazards_num=1"),
+        ([f"+note={'a' * 300}"], f"+note={'a' * 194}-2c268a09"),
     ],
 )
 def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
@@ -112,6 +114,14 @@ def test_folders_of_a_sweep_name_what_a_person_overrode(words, between):
     finally:
         HydraConfig.instance().cfg = before
     assert folder == Path("PointGoal1") / "cpo" / between / "seed0"
+
+
+@pytest.mark.parametrize(("algo", "value"), [("ppo", 1.0), ("cpo", -math.inf)])
+def test_only_an_algorithm_that_keeps_limits_is_judged_by_them(monkeypatch, algo, value):
+    monkeypatch.setattr("safe_rl.training.train.train", lambda *_, **__: None)
+    final = {"episode_return": 1.0, "episode_cost": 60.0}
+    run = SimpleNamespace(is_run=False, directory=None, final=final, cost_limits={"cost": 25.0})
+    assert run_job(composed(f"algo={algo}")[0], None, run) == value
 
 
 def sweep(directory, *overrides, status=0):

@@ -157,3 +157,12 @@ def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypat
     monkeypatch.setattr(Trainer, "epoch", fail)
     (line,) = command(*SMALL, "frames=40")[0].splitlines()
     assert words in line
+
+
+def test_an_error_that_no_setting_explains_keeps_its_traceback(command, monkeypatch):
+    def fail(trainer, batches):
+        raise ValueError("shapes differ")
+
+    monkeypatch.setattr(Trainer, "epoch", fail)
+    with pytest.raises(ValueError, match="shapes differ"):
+        command(*SMALL, "frames=40")

@@ -41,7 +41,7 @@ def test_every_row_is_about_a_key_that_exists(all_keys):
         if row.startswith("*."):
             assert any(key.endswith(row[1:]) for key in keys)
         else:
-            assert row in keys or row.startswith(("hydra", "env."))
+            assert row in keys or row.startswith("env.")
 
 
 def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all_keys):
@@ -62,8 +62,6 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
         ("logger._target_", Role.MACHINE),
         ("note", Role.MANNER),
         ("collector._target_", Role.MANNER),
-        ("hydra.verbose", Role.MACHINE),
-        ("hydra.run.dir", Role.MANNER),
         ("mine", Role.EXPERIMENT),
     ],
 )
