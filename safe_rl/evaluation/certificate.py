@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from safe_rl.evaluation.settings import CertificateOptions
 from safe_rl.runs.folder import checkpoint_steps
@@ -107,3 +108,13 @@ class Certificate:
             most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
             sentences.append(f"The bound includes rare episodes that cost up to {most}.")
         return " ".join([*sentences, "Not covered: single episodes, other environments."])
+
+
+def has_options(content: Mapping[str, Any], options: CertificateOptions) -> bool:
+    """Whether a test with these options wrote this content of ``certificate.json``.
+
+    Options that the file of an earlier version lacks count as equal.
+    """
+    # in the file ``episodes`` is the number that the test needed
+    written = {**content, "episodes": content.get("most_episodes", options.episodes)}
+    return all(written.get(name, value) == value for name, value in asdict(options).items())
