@@ -68,9 +68,8 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _published(experiment: Experiment) -> dict[str, Any]:
-    """Published values for the same environment, which no transform changes, and algorithm."""
-    changed = any(run.settings.get("transforms") for run in experiment.runs)
-    if changed or experiment.is_continued or not experiment.has_published_limit:
+    """Published values for the same problem and algorithm."""
+    if not experiment.is_published_problem:
         return {}
     paper = experiment.reference if experiment.base == "ppo" else None
     later = benchmark.REIMPLEMENTATIONS.get(experiment.benchmark or "", {}).get(experiment.base)
