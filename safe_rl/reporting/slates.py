@@ -57,8 +57,8 @@ def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.nd
         returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
         # J_c, or the other measure that the run compares with the limit
         limit = e.limits["cost"]
-        judged = limit + np.array([run.excess("cost") for run in e.finished])
-        scores = benchmark.normalise(returns, judged, rates, limit=limit, reference=e.reference)
+        measures = limit + np.array([run.excess("cost") for run in e.finished])
+        scores = benchmark.normalise(returns, measures, rates, limit=limit, reference=e.reference)
         for name, values in zip(strata, scores, strict=True):
             strata[name].append(values)
     return strata
