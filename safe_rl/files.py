@@ -220,7 +220,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def load_tensors(path: Path, *, lazy: bool = False) -> Any:
-    """Read a file of `save_tensors`, also of another person; no code in it is run.
+    """Read a file of `save_tensors` into main memory, also of another person; no code in it is run.
 
     Args:
         path: The file.
@@ -237,8 +237,6 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
     """
     import torch
 
-    # without a GPU, tensors that were on one are read into main memory
-    device = None if torch.cuda.is_available() and not lazy else "cpu"
     try:
         if not path.is_file():
             raise ValueError("there is no such file")
@@ -248,7 +246,8 @@ def load_tensors(path: Path, *, lazy: bool = False) -> Any:
                 raise ValueError("it has compressed parts, which could fill the memory")
             if not lazy and (part := archive.testzip()) is not None:
                 raise ValueError(f"its part {part} is damaged")
-        return torch.load(path, map_location=device, weights_only=True, mmap=lazy)
+        # who loads a state copies it to a device of this machine; the writer's may not exist here
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=lazy)
     except Exception as error:  # a file of unknown origin can be wrong in any way
         words = " ".join(str(error).split()) or type(error).__name__
         if "weights_only" in words:  # torch's message advises to turn off this protection

@@ -4,11 +4,21 @@ import gzip
 import os
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.files import check_no_links, read_bounded, read_config, read_json, read_yaml, replacing
+from safe_rl.files import (
+    check_no_links,
+    load_tensors,
+    read_bounded,
+    read_config,
+    read_json,
+    read_yaml,
+    replacing,
+    save_tensors,
+)
 from safe_rl.reporting.archive import read_archive
 from safe_rl.runs import table
 from safe_rl.runs.folder import paths_below
@@ -162,3 +172,12 @@ def test_a_hint_does_not_search_a_whole_disk(tmp_path, monkeypatch):
         Run(tmp_path).check_is_run()
     assert len(seen) <= 1_001
     assert len(paths_below(tmp_path, "*")) == 1_101
+
+
+def test_tensors_of_a_device_that_is_missing_here_are_read_into_main_memory(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("torch.serialization.location_tag", lambda storage: "cuda:1")
+        save_tensors(tmp_path / "state.pt", {"x": torch.ones(2)})
+    for name, value in (("is_available", True), ("device_count", 1)):
+        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+    assert load_tensors(tmp_path / "state.pt")["x"].device.type == "cpu"

@@ -70,7 +70,7 @@ def train(
         directory: Folder of the run; None: ``runs/<env>/<algo>/<date>_seed<seed>``.
         imports: A module of yours to import first, or several, as the command's ``import=``.
         callbacks: Called after every epoch with its row of the table. If one returns False, the
-            run ends like a finished one.
+            run ends, with its certificate; it can be resumed, and reports call it unfinished.
         config_dir: A folder with YAML files of yours, or several, as the command's
             ``--config-dir``.
         settings: Any key of ``conf/``: ``frames=100_000``, ``preset="gpu"``,
@@ -268,7 +268,7 @@ class Run(RecordedRun):
 
     def plot(self) -> Figure:
         """Its learning curves, a Matplotlib figure: return, costs, cost rates and multipliers."""
-        length = self.env.max_episode_steps
+        length = self.episode_length or self.env.max_episode_steps
         title = f"{self.environment} {self.algorithm} seed {self.seed}"
         return learning_curves(self.table, self.cost_limits, length, title, self.measure)
 

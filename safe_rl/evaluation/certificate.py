@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from safe_rl.evaluation.settings import CertificateOptions
 from safe_rl.runs.folder import checkpoint_steps
@@ -46,39 +47,39 @@ class Certificate:
         if self.test > 1:
             episodes += f", test {self.test} of this run; the level is that of all its tests"
         if self.checkpoint is None:
-            missing = "; ".join(self._on(name) for name in verdict.shortfalls)
+            missing = "; ".join(self._bound_text(name) for name in verdict.shortfalls)
             line = (
                 f"Not certified {level} {actions}: no checkpoint's bound is within its limit "
                 f"({missing}; {episodes})."
             )
-            return line + self._on_fewest()
+            return line + self._episodes_needed_text()
         if set(verdict.by_construction) == set(verdict.bounds):
             head = f"Limit kept {actions}"
         elif len(verdict.bounds) > 1:
             head = f"Certified {level} {actions}, all bounds together"
         else:
             head = f"Certified {level} {actions}"
-        lines = [self._on(name) for name in verdict.bounds]
+        lines = [self._bound_text(name) for name in verdict.bounds]
         after = f"{checkpoint_steps(self.checkpoint):,} steps, return {self.episode_return:.2f}"
         if len(lines) == 1:
             mean_cost = next(iter(self.means.values()), math.nan)
             mean = f", mean {mean_cost:.3g} in {self.further} further episodes, at {after}"
-            return f"{head}: {lines[0]} ({episodes}){mean}. {self._on_rare_episodes()}"
+            return f"{head}: {lines[0]} ({episodes}){mean}. {self._not_covered_text()}"
         rows = [
             f"  {line}, mean {self.means.get(name, math.nan):.3g}"
             for name, line in zip(verdict.bounds, lines, strict=True)
         ]
         head += f" ({episodes}; means of {self.further} further episodes; at {after}):"
-        return "\n".join([head, *rows, self._on_rare_episodes()])
+        return "\n".join([head, *rows, self._not_covered_text()])
 
-    def _on(self, name: str) -> str:
+    def _bound_text(self, name: str) -> str:
         """Text on one bound."""
         bound, limit = self.verdict.bounds[name]
         if name in self.verdict.by_construction:
             return f"{name} ≤ {rounded_up(bound):.3g} by construction, limit {limit:g}"
         return f"{name} ≤ {rounded_up(bound):.3g}, limit {limit:g}"
 
-    def _on_fewest(self) -> str:
+    def _episodes_needed_text(self) -> str:
         """Text on the number of episodes, if the test had too few to succeed."""
         if self.fewest <= self.options.episodes:
             return ""
@@ -89,7 +90,7 @@ class Certificate:
             f"costs anything, and several times that as a rule (certificate.episodes=…)."
         )
 
-    def _on_rare_episodes(self) -> str:
+    def _not_covered_text(self) -> str:
         """Text on what the bounds do not cover."""
         sentences = []
         capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
@@ -107,3 +108,13 @@ class Certificate:
             most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
             sentences.append(f"The bound includes rare episodes that cost up to {most}.")
         return " ".join([*sentences, "Not covered: single episodes, other environments."])
+
+
+def has_options(content: Mapping[str, Any], options: CertificateOptions) -> bool:
+    """Whether a test with these options wrote this content of ``certificate.json``.
+
+    Options that the file of an earlier version lacks count as equal.
+    """
+    # in the file ``episodes`` is the number that the test needed
+    written = {**content, "episodes": content.get("most_episodes", options.episodes)}
+    return all(written.get(name, value) == value for name, value in asdict(options).items())

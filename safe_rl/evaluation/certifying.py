@@ -22,7 +22,7 @@ from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.measuring import PolicyEvaluation
-from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions
+from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions, is_device
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
 from safe_rl.runs.folder import checkpoint_steps
@@ -34,6 +34,7 @@ from safe_rl.scores.certificate import Claim, error_of_next_test, first_certifie
 _BATCH, _BATCH_OF_WARP = 100, 1_000
 # added to the seed: so far apart that no test of a run has the episodes of another run's ranking
 _RANKING, _TEST, _AFTER = 100_000_000_003, 200_000_000_041, 300_000_000_077
+_OF_EXPORTED = 50_000_000_021  # of an exported policy, which the tests of its run have chosen
 # of two batches, which have new instances of the environment; of two tests of a run
 _NEXT_BATCH, _NEXT_TEST = 1_000_003, 1_000_000_000_039
 _ROUNDS = (0.25, 0.25, 0.5)  # shares of the ranking's episodes in its rounds
@@ -73,26 +74,28 @@ def certify(
     candidates = _candidates(run)
     if not limits or not candidates:
         return None
-    # the device of training, where the simulation may run; without a GPU, the CPU
-    device = config.device if torch.cuda.is_available() else "cpu"
+    # the device of training, where the simulation may run, if this machine has it
+    device = next(filter(is_device, (config.device, "cuda", "cpu")))
     plain = EvaluationOptions(
         device=device, num_threads=num_threads, deterministic=options.deterministic
     )
     make = make_env or maker_of(directory)
     evaluations = [PolicyEvaluation(config, path, plain, make) for path in candidates]
-    asked = ("most_over", "bound", "cap", "most_beyond", "tail")
-    claim = Claim(limits, **{name: getattr(options, name) for name in asked})
+    claimed = ("most_over", "bound", "cap", "most_beyond", "tail")
+    claim = Claim(limits, **{name: getattr(options, name) for name in claimed})
     number, error = _spend(run, options, candidates)
     claim = replace(claim, level=1 - error)
     order, claims = _ranked(evaluations, claim, options, progress)
-    seed = _TEST + (number - 1) * _NEXT_TEST
+    seed = _TEST + (number - 1) * _NEXT_TEST + (0 if run.has_begun else _OF_EXPORTED)
+    # they share the error; how many there are is known before the first episode of the test
+    tests = min(options.tests, len(candidates))
 
     def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
         for _, (episodes,) in _run([evaluations[candidate]], seed, options.episodes, progress):
             yield _costs(episodes)
 
-    verdict = first_certified(order, collect, claims, options.tests, options.episodes)
-    fewest = claims[order[0]].fewest(options.tests)
+    verdict = first_certified(order, collect, claims, tests, options.episodes)
+    fewest = claims[order[0]].fewest(tests)
     certificate = Certificate(None, math.nan, verdict, options, test=number, fewest=fewest)
     if (chosen := verdict.certified) is not None:
         # episodes of the test have decided when it ended: it ends when costs happen to be low
@@ -118,10 +121,10 @@ def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) ->
     is_list = isinstance(tests, list) and all(isinstance(former, dict) for former in tests)
     if not is_list or not all(is_number(former.get("error")) for former in tests):
         raise ValueError(f"{run.tests_file} is not as a run writes it: restore it.")
-    asked: dict[str, Any] = {"options": asdict(options), "limits": run.cost_limits}
-    asked["candidates"] = [path.name for path in candidates]
+    test: dict[str, Any] = {"options": asdict(options), "limits": run.cost_limits}
+    test["candidates"] = [path.name for path in candidates]
     for number, former in enumerate(tests, 1):
-        if all(former.get(key) == value for key, value in asked.items()):
+        if all(former.get(key) == value for key, value in test.items()):
             return number, former["error"]
     spent = [former["error"] for former in tests]
     error = error_of_next_test(options.level, spent)
@@ -131,7 +134,7 @@ def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) ->
             f"{sum(spent):.3g}. All of its tests together can have a level below "
             f"{1 - sum(spent):.5g}: certificate.level={1 - 2 * sum(spent):.3g}"
         )
-    replace_json(run.tests_file, [*tests, {**asked, "error": error}])
+    replace_json(run.tests_file, [*tests, {**test, "error": error}])
     return len(tests) + 1, error
 
 
@@ -162,7 +165,7 @@ def _ranked(
                 episodes_of[candidate].append(batch)
         claim = replace(claim, highest=highest)
         costs = [_costs(*parts) for parts in episodes_of]
-        claims = [claim.with_thresholds(of_one) for of_one in costs]
+        claims = [claim.with_thresholds(of_candidate) for of_candidate in costs]
         returns = [torch.cat([part.returns for part in parts]).numpy() for parts in episodes_of]
         order = rank(
             [returns[candidate] for candidate in left],

@@ -27,7 +27,8 @@ PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
 
 
-def _is_device(value: Any) -> bool:
+def is_device(value: Any) -> bool:
+    """Whether torch finds this device here."""
     import torch  # here, because help and configurations are shown without it
 
     try:
@@ -39,7 +40,7 @@ def _is_device(value: Any) -> bool:
 
 
 Device = Annotated[
-    str, rule(_is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
+    str, rule(is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
 ]
 _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"

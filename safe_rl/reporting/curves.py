@@ -118,9 +118,8 @@ def comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -
         for e in experiments
         if e.benchmark in environments
         and e.base in ALGORITHMS
-        and e.has_published_limit
+        and e.is_published_problem
         and e.finished
-        and not (e.is_continued or e.runs[0].settings.get("transforms"))
     ]
     cells = Counter(s for _, _, s in {(e.benchmark, e.base, e.planned_steps) for e in known})
     steps = max(cells, key=lambda steps: (cells[steps], steps), default=0)

@@ -77,19 +77,21 @@ class Experiment:
         return self.runs[0].cost_limits
 
     @property
-    def has_published_limit(self) -> bool:
-        """Whether its only limit is that of the published results."""
-        return self.limits == {"cost": COST_LIMIT} and not self.limits_of_other_measures
-
-    @property
     def limits_of_other_measures(self) -> list[str]:
         """Cost keys whose limit is on another measure than the mean cost of an episode."""
         return [k for k in self.limits if any(run.limits_another_measure(k) for run in self.runs)]
 
     @property
-    def is_continued(self) -> bool:
-        """Whether a run of it started from another run's networks."""
-        return any(run.settings.get("init_from") is not None for run in self.runs)
+    def is_plain(self) -> bool:
+        """Whether no transform changes its environment, and no run began with trained networks."""
+        settings = [run.settings for run in self.runs]
+        return not any(s.get("transforms") or s.get("init_from") is not None for s in settings)
+
+    @property
+    def is_published_problem(self) -> bool:
+        """Whether it is plain, and its only limit is that of the published results."""
+        has_limit = self.limits == {"cost": COST_LIMIT} and not self.limits_of_other_measures
+        return has_limit and self.is_plain
 
     @property
     def finished(self) -> tuple[Run, ...]:

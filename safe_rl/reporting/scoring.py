@@ -68,9 +68,8 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def _published(experiment: Experiment) -> dict[str, Any]:
-    """Published values for the same environment, which no transform changes, and algorithm."""
-    changed = any(run.settings.get("transforms") for run in experiment.runs)
-    if changed or experiment.is_continued or not experiment.has_published_limit:
+    """Published values for the same problem and algorithm."""
+    if not experiment.is_published_problem:
         return {}
     paper = experiment.reference if experiment.base == "ppo" else None
     later = benchmark.REIMPLEMENTATIONS.get(experiment.benchmark or "", {}).get(experiment.base)
@@ -195,11 +194,11 @@ def _learning_figures(run: Run) -> dict[str, float]:
         return figures
     width = final_width(run.column("steps"))
     for key, limit in run.cost_limits.items():
-        judged = costs = run.column(f"episode_{key}")
+        measures = costs = run.column(f"episode_{key}")
         if run.limits_another_measure(key):
             violation = run.column(f"violation_{key}")
-            judged = np.where(np.isfinite(violation), limit + violation, costs)
-        spans = benchmark.joined(judged, width // FINAL_EPOCHS)
+            measures = np.where(np.isfinite(violation), limit + violation, costs)
+        spans = benchmark.joined(measures, width // FINAL_EPOCHS)
         figures |= {f"{name}_{key}": v for name, v in benchmark.learning_cost(spans, limit).items()}
     return figures
 
@@ -287,8 +286,8 @@ def evaluation_table(experiments: Sequence[Experiment]) -> Table:
 
     def over(row: Record) -> str:
         # a limit on another measure than the mean is not judged by these episodes' mean
-        judged = row.get("key") not in others[row["environment"], row["algorithm"]]
-        return "bad" if judged and row.get("mean", 0.0) > row.get("limit", inf) else ""
+        is_mean_limited = row.get("key") not in others[row["environment"], row["algorithm"]]
+        return "bad" if is_mean_limited and row.get("mean", 0.0) > row.get("limit", inf) else ""
 
     rows = each_cost(records, keys, **fields)
     return Table("evaluations", "Evaluations", columns, records, shown=rows, marks={"$J_c$": over})

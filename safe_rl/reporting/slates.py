@@ -24,12 +24,12 @@ def complete_slates(
     """Slates that one algorithm or more has complete, and the environments that all share.
 
     Yields the name of a slate, and for each algorithm with at least ``needed`` finished runs per
-    environment its experiments, one per environment, with a limit on ``cost``. Runs that started
-    from another run's networks do not count.
+    environment its experiments, one per environment, with a limit on ``cost``. Only plain
+    experiments count.
     """
     by_algorithm: dict[str, dict[str, Experiment]] = {}
     for e in experiments:
-        if e.benchmark in benchmark.REFERENCE and not e.is_continued:
+        if e.benchmark in benchmark.REFERENCE and e.is_plain:
             cell = by_algorithm.setdefault(e.algorithm, {})
             if "cost" in e.limits and e.finished:
                 cell[str(e.benchmark)] = e
@@ -57,8 +57,8 @@ def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.nd
         returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
         # J_c, or the other measure that the run compares with the limit
         limit = e.limits["cost"]
-        judged = limit + np.array([run.excess("cost") for run in e.finished])
-        scores = benchmark.normalise(returns, judged, rates, limit=limit, reference=e.reference)
+        measures = limit + np.array([run.excess("cost") for run in e.finished])
+        scores = benchmark.normalise(returns, measures, rates, limit=limit, reference=e.reference)
         for name, values in zip(strata, scores, strict=True):
             strata[name].append(values)
     return strata
@@ -81,7 +81,7 @@ def _record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
             names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
             record |= zip(names, interquartile_mean(strata[name]), strict=True)
     paper = benchmark.PUBLISHED.get(slate, {}).get(experiments[0].base)
-    if paper and all(e.has_published_limit for e in experiments):
+    if paper and all(e.is_published_problem for e in experiments):
         record |= {f"paper_{name}": value for name, value in paper._asdict().items()}
     return record
 
@@ -125,7 +125,7 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
     """
     by_algorithm: dict[str, list[Experiment]] = {}
     for e in experiments:
-        is_ours = e.base in benchmark.ALGORITHMS and not e.is_continued and "cost" in e.limits
+        is_ours = e.base in benchmark.ALGORITHMS and e.is_published_problem
         if is_ours and e.reference is not None and e.finished:
             by_algorithm.setdefault(e.algorithm, []).append(e)
     records: list[dict[str, Any]] = []

@@ -138,7 +138,7 @@ def final_figures(
 def outcome_line(
     table: Mapping[str, Sequence[float]],
     limits: Mapping[str, float],
-    episode_length: int,
+    episode_length: int | None,
     measure: str = "mean",
 ) -> str:
     """One line about the end of a run: return and costs over its last epochs.
@@ -150,12 +150,15 @@ def outcome_line(
         'Return 1.50, cost 25.0 (limit 25) per episode, mean of steps 1 to 2,000; 500 steps/s'
         >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, 1000)
         'No episode of 1,000 steps has ended; 500 steps/s'
+        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, None)
+        'No episode has ended; 500 steps/s'
     """
     keys = list(limits) or ["cost"]
     final, rows = final_figures(table, keys), final_rows(table)
     speed = f"{final['steps_per_second']:,.0f} steps/s"
     if not rows:
-        return f"No episode of {episode_length:,} steps has ended; {speed}"
+        steps = "" if episode_length is None else f" of {episode_length:,} steps"
+        return f"No episode{steps} has ended; {speed}"
     what = f"Return {final['episode_return']:.2f}"
     for key in keys:
         limit = f" (limit {limits[key]:g})" if key in limits else ""

@@ -294,7 +294,7 @@ class Run:
     @property
     def outcome(self) -> str:
         """One line about its end: return and costs over its last epochs."""
-        return outcome_line(self.table, self.cost_limits, self.episode_length or 1000, self.measure)
+        return outcome_line(self.table, self.cost_limits, self.episode_length, self.measure)
 
     def excess(self, key: str) -> float:
         """Excess of the limited measure over its limit, a mean over the last epochs."""
@@ -316,11 +316,6 @@ class Run:
         if not isinstance(content, dict):
             raise ValueError(f"{self.certificate_file} is not as a run writes it.")
         return content
-
-    @property
-    def evaluations(self) -> list[dict[str, Any]]:
-        """The contents of the files of all evaluations."""
-        return [read_json(path) for path in self.evaluation_files]
 
     @property
     def code(self) -> list[dict[str, Any]] | None:

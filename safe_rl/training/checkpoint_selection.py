@@ -1,4 +1,4 @@
-"""Selection of the best checkpoints: each policy is evaluated by its own episodes."""
+"""Selection of the best checkpoints: each policy is scored by its own episodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from safe_rl.runs.figures import feasible_return
 _LONGEST = 10
 
 
-def epochs_until_evaluated(over: int, length: float, steps_per_epoch: float) -> int:
+def epochs_until_scored(over: int, length: float, steps_per_epoch: float) -> int:
     """Epochs from a policy's update until the finished episodes are, on average, its own.
 
     A policy collects its batch in the epoch after its update. Episodes that are longer than a batch
@@ -24,9 +24,9 @@ def epochs_until_evaluated(over: int, length: float, steps_per_epoch: float) -> 
     Returns and costs are averaged over a number of epochs, `over`.
 
     Examples:
-        >>> epochs_until_evaluated(over=1, length=1000, steps_per_epoch=1000)
+        >>> epochs_until_scored(over=1, length=1000, steps_per_epoch=1000)
         1
-        >>> epochs_until_evaluated(over=3, length=1000, steps_per_epoch=200)
+        >>> epochs_until_scored(over=3, length=1000, steps_per_epoch=200)
         4
     """
     lag = length / steps_per_epoch / 2 if length > steps_per_epoch else 0.0
@@ -83,36 +83,36 @@ class CheckpointSelection(Resumable):
             self._take(row)
 
     def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Add an epoch, and evaluate the waiting policy whose epochs are complete.
+        """Add an epoch, and score the waiting policy whose epochs are complete.
 
         Args:
             row: Of the run's table, by column.
 
         Returns:
             Keyword arguments of `CheckpointStore.save_best` for the policy, if it kept every limit.
-            If episodes have become shorter, several are due, and only the latest is evaluated.
+            If episodes have become shorter, several are due, and only the latest is scored.
         """
         self._take(row)
         states = copy.deepcopy(states_of(self._components))
         self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
-        delay = epochs_until_evaluated(self._over, self._length, self._steps_per_epoch)
+        delay = epochs_until_scored(self._over, self._length, self._steps_per_epoch)
         due = len(self.waiting) - delay
         passed = [self.waiting.pop(0) for _ in range(due)]
-        return self._evaluate(passed[-1]) if passed else []
+        return self._score(passed[-1]) if passed else []
 
     def _take(self, row: Mapping[str, float]) -> None:
         self._latest.append(row)
         length = row.get("episode_length", math.nan)
         self._length = length if math.isfinite(length) else self._length
 
-    def evaluate_all(self) -> list[dict[str, Any]]:
-        """Evaluate all waiting policies by the epochs so far, at the end of a run.
+    def score_all(self) -> list[dict[str, Any]]:
+        """Score all waiting policies by the epochs so far, at the end of a run.
 
-        They keep waiting, because a resumed run has later epochs to evaluate them by.
+        They keep waiting, because a resumed run has later epochs to score them by.
         """
-        return [evaluated for policy in self.waiting for evaluated in self._evaluate(policy)]
+        return [scored for policy in self.waiting for scored in self._score(policy)]
 
-    def _evaluate(self, policy: Mapping[str, Any]) -> list[dict[str, Any]]:
+    def _score(self, policy: Mapping[str, Any]) -> list[dict[str, Any]]:
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []

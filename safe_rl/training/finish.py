@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from safe_rl.evaluation import Certificate, certify
+from safe_rl.evaluation.certificate import has_options
 from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import certificate_options
 from safe_rl.runs.folder import checkpoint_steps, lock_folder
@@ -57,7 +58,9 @@ def certify_finished(
     again: str,
     say: Callable[[str], None],
 ) -> None:
-    """Certify a finished run that is to keep limits, unless it is short or certified already.
+    """Certify a finished run that is to keep limits, unless it is short or tested already.
+
+    A tested one is tested again if the configuration has other options for the test.
 
     Args:
         run: The run.
@@ -72,26 +75,32 @@ def certify_finished(
     """
     # steps of a test that stops early, after a fifth of its episodes
     steps = int(config.certificate.episodes * length / 5)
-    newest, tested = run.newest_checkpoint(), (run.certificate or {}).get("candidates") or ()
-    if not steps or (newest is not None and checkpoint_steps(newest) in tested):
+    newest, certificate = run.newest_checkpoint(), run.certificate or {}
+    tested = certificate.get("candidates") or ()
+    is_tested = newest is not None and checkpoint_steps(newest) in tested
+    # a certificate with the options of `safe-rl evaluate` stays if the run's own are unchanged
+    is_unchanged = config.certificate == run.config.certificate
+    has_same_options = is_unchanged or has_options(certificate, certificate_options(config))
+    if not steps or (is_tested and has_same_options):
         return
     if steps > config.frames:
+        given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
         say(
             f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "
             f"steps of certificate.episodes={config.certificate.episodes} episodes. To make a "
             "certificate all the same: safe-rl evaluate "
-            f"{quote(str(run.directory))} certify=true{import_words(config)}"
+            f"{quote(str(run.directory))} certify=true{given}{import_words(config)}"
         )
         return
     later = f"Interrupted before it was certified. To do so: {again}"
     end_by(stopped_by, later)
     threads, changes = config.num_threads or 0, config.certificate
     try:
-        certificate = certify_run(run.directory, num_threads=threads, changes=changes)
+        result = certify_run(run.directory, num_threads=threads, changes=changes)
     except KeyboardInterrupt:
         return end_by(SIGINT, later)
-    say(str(certificate))
-    if certificate is not None and certificate.checkpoint is None:
+    say(str(result))
+    if result is not None and result.checkpoint is None:
         say(f"To train on: {again} frames={2 * config.frames:_}")
 
 

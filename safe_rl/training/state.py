@@ -107,7 +107,14 @@ class EnvSnapshot:
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore the environment, and let the collector continue from it."""
-        self._go_on_from(self._snapshot.from_dict(state_dict, batch_size=self._env.batch_size))
+        saved = self._snapshot.from_dict(state_dict, batch_size=self._env.batch_size)
+        # to the devices of the present state, where it has the entry
+        moved = saved.apply(
+            lambda new, old: new if old is None else new.to(old.device),
+            self._snapshot,
+            default=None,
+        )
+        self._go_on_from(moved)
 
     def _go_on_from(self, snapshot: TensorDictBase) -> None:
         self._snapshot = snapshot

@@ -202,7 +202,7 @@ class Trainer:
                 # batches after the checkpoint are removed, as rows of the table are
                 self._recording.begin(self.progress.epoch)
             self._selection.continue_after(self.writer.rows())
-            # if the run was shorter before, these were evaluated by fewer epochs at its end
+            # if the run was shorter before, these were scored by fewer epochs at its end
             self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
@@ -221,7 +221,7 @@ class Trainer:
             self.stopped_by = stop.received
             if self.is_finished:
                 # before the last checkpoint is written, which marks the run as finished
-                for policy in self._selection.evaluate_all():
+                for policy in self._selection.score_all():
                     self._checkpoints.save_best(**policy)
             self._save()
 

@@ -12,6 +12,7 @@ from run_configs import compose_config, without_times
 
 import safe_rl
 from safe_rl.evaluation.policies import pack_policy
+from safe_rl.files import read_json
 from safe_rl.runs.folder import is_unfinished
 from safe_rl.runs.run import Run
 from safe_rl.training.train import train
@@ -91,7 +92,7 @@ def test_what_is_killed_can_be_done_again_and_says_nothing_false(work, trained, 
             killed(random.uniform(0, 3), work, folder)
             run = safe_rl.load(folder, checkpoint="certified")
             assert run.certificate_of(run.find_checkpoint("certified")) is not None
-            assert run.evaluations is not None
+            assert all(map(read_json, run.evaluation_files))
         work(folder)
         assert not list((folder / "packed").glob(".*")) or work is not export
     finally:

@@ -236,6 +236,43 @@ def test_an_exported_policy_is_certified_anew_and_keeps_its_weights(train, tmp_p
         Run(folder).find_checkpoint("certified")
 
 
+def test_one_candidate_has_the_error_of_a_test_alone_and_episodes_that_have_not_chosen_it(
+    train, tmp_path
+):
+    run, tested = train("{cost: 19}"), {}
+
+    def make(node, *, seed, **keys):
+        tested[place].add(seed)
+        return make_env(node, seed=seed, **keys)
+
+    fewest = []
+    for place, tests in (("run", 1), ("alone", 1), ("of three", 3)):
+        tested[place] = set()
+        folder = run if place == "run" else pack_policy(run, tmp_path / place).parents[2]
+        options = replace(OPTIONS, tests=tests)
+        fewest.append(certify(folder, options, make_env=make).fewest)
+    assert fewest[0] == fewest[1] == fewest[2]
+    seeds = {place: {seed for seed in found if seed > _TEST} for place, found in tested.items()}
+    assert seeds["alone"] == seeds["of three"]
+    assert not seeds["run"] & seeds["alone"]
+
+
+def test_a_device_that_this_machine_lacks_is_replaced(train, monkeypatch):
+    directory, met = train("{cost: 19}"), []
+    config = directory / "config.yaml"
+    config.write_text(config.read_text().replace("device: cpu", "device: cuda:1"))
+    for name, value in (("is_available", True), ("device_count", 1)):
+        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
+
+    def make(node, *, device, **keys):
+        met.append(device)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        certify(directory, OPTIONS, make_env=make)
+    assert met == ["cuda"]
+
+
 def test_without_limits_there_is_nothing_to_certify(train):
     directory = train("{}", "algo=ppo")
     assert certify(directory, OPTIONS, make_env=make_env) is None

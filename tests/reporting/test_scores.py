@@ -153,7 +153,7 @@ def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
     found = {e.algorithm: normalised_scores([e])["violation"][0] for e in experiments}
     assert found["yours"] == 0.0
     assert found["mine"] == pytest.approx(10 / (REFERENCE["PointGoal1"][1] - 25))
-    assert [e.has_published_limit for e in experiments] == [True, False, False]
+    assert [e.is_published_problem for e in experiments] == [True, False, False]
 
 
 def write_slate(root, algo, multiples):
@@ -204,10 +204,11 @@ def test_a_complete_slate_is_averaged_over_environments_and_seeds(tmp_path):
     [
         {"init_from": "runs/PointGoal1/cpo/seed0"}, {"env_changes": {"size": 3}},
         {"limits": {"cost_hazards": 25.0}}, {"frames": 10**6},
+        {"transforms": {"early_termination": {"budgets": {"cost": 24}}}},
     ],
 )  # fmt: skip
 def test_what_counts_towards_no_slate(changes, tmp_path):
-    """Continued runs, other environments, limits on other costs, and runs that go on."""
+    """Changed problems, continued runs, limits on other costs, and runs that go on."""
     for env in SLATES["SG6"]:
         write_run(tmp_path, env, "cpo", **changes)
     result = build_report(tmp_path, SUITE, ReportOptions(seeds=1))
@@ -240,6 +241,7 @@ def test_the_papers_tables_have_what_there_is_beside_the_published_values(tmp_pa
             rate = scores.cost_rate * (factor if algo != "cpo" else 0.6)
             rows = {"returns": [factor * scores.episode_return], "costs": [cost], "rates": [rate]}
             write_run(tmp_path, env, algo, **rows)
+    write_run(tmp_path, algo="trpo", returns=[99.0], limits={"cost": 50.0})  # dominates nothing
     rows = texts_of(paper_table(experiments_in(tmp_path)))
     slates = {row["slate"] for row in rows}
     assert slates == {"SG18", "SG12", "SG6", "SG1", "SG2", "SGPoint", "SGCar"}

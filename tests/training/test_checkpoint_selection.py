@@ -81,7 +81,7 @@ def test_limits_are_held_against_the_mean_of_the_epochs():
         kept += [one["steps"] for one in selection.add(row)]
     # means of 29, 23, 13, of which each judges the policy of two epochs before
     assert kept == [2, 3]
-    assert [one["steps"] for one in selection.evaluate_all()] == [4, 5]
+    assert [one["steps"] for one in selection.score_all()] == [4, 5]
     assert [policy["steps"] for policy in selection.waiting] == [4, 5]
 
 
@@ -98,7 +98,7 @@ def test_who_was_judged_at_the_end_is_judged_again_by_epochs_that_come_later():
     selection = CheckpointSelection({}, {"cost": 25.0}, over=1, steps_per_epoch=1, longest=1)
     row = {"epoch": 1, "steps": 1, "episode_return": 1.0}
     assert selection.add(row | {"episode_cost": 20.0}) == []
-    assert [one["steps"] for one in selection.evaluate_all()] == [1]
+    assert [one["steps"] for one in selection.score_all()] == [1]
     assert selection.add(row | {"steps": 2, "episode_cost": 30.0}) == []
     assert [policy["steps"] for policy in selection.waiting] == [2]
 

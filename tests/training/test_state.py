@@ -2,13 +2,15 @@
 
 import signal
 import threading
+from types import SimpleNamespace
 
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer
+from tensordict import TensorDict
 
 from safe_rl.runs.table import read_table
-from safe_rl.training.state import RandomGenerators, StopRequest
+from safe_rl.training.state import EnvSnapshot, RandomGenerators, StopRequest
 
 
 def signal_in(trainer, epoch):
@@ -82,3 +84,12 @@ def test_a_machine_without_accelerators_restores_the_generator_of_its_cpu(monkey
     other = state["torch_cpu"]
     RandomGenerators().load_state_dict({**state, "torch_cuda": [other] * 2, "torch_mps": other})
     assert torch.equal(torch.rand(3), drawn)
+
+
+def test_a_state_from_a_file_goes_to_the_devices_of_the_environment():
+    present = TensorDict({"a": torch.ones(2), "t": {"x": torch.ones(2)}}, [2]).to("meta")
+    met = []
+    env = SimpleNamespace(get_state=lambda: present, set_state=met.append, batch_size=[2])
+    snapshot = EnvSnapshot(env, SimpleNamespace(_carrier=SimpleNamespace(update=lambda _: None)))
+    snapshot.load_state_dict({"a": torch.ones(2), "t": {"x": torch.ones(2)}})
+    assert {value.device.type for value in met[0].values(True, True)} == {"meta"}

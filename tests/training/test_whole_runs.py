@@ -71,6 +71,16 @@ def test_a_job_that_dies_before_its_certificate_is_certified_by_the_next_sweep(
     run_job(small(), None, Run(tmp_path / "run"))
 
 
+def test_a_finished_run_is_tested_again_if_other_options_are_given(tmp_path, monkeypatch):
+    run = train(small(), tmp_path / "run")
+    more = "certificate.episodes=5"
+    train(small(more), run.directory, continues=True)
+    assert run.certificate["most_episodes"] == 5
+    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("tested again"))
+    train(small(more), run.directory, continues=True)
+    train(small(), run.directory, continues=True)
+
+
 def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, monkeypatch):
     """An environment without ``num_steps``: 500 steps, not 1,000."""
     words = ("env=gymnasium", "env.id=CartPole-v1", "env.outside={cost_far: [0, -1, 1]}")
