@@ -333,8 +333,7 @@ def make_env(
     if target is not None or transforms:
         check_constrained_env(batch)
     if list(batch.batch_size) != [num_envs]:
-        number = batch.batch_size[0]
-        raise ContractError(f"{target} made {number} environments instead of num_envs={num_envs}.")
+        raise ContractError(f"{target} made {batch.batch_size[0]} environments, not {num_envs=}.")
     return batch
 
 
