@@ -21,6 +21,21 @@ def pytest_runtest_setup(item):
         pytest.skip("no GPU here")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def drawing():
+    """Learning curves take a second per run: they are drawn for tests that ask for `curves`."""
+    from safe_rl.runs.writing import RunWriter
+
+    draw, RunWriter.draw_curves = RunWriter.draw_curves, lambda writer: None
+    return draw
+
+
+@pytest.fixture
+def curves(drawing, monkeypatch):
+    """For tests of what a run draws at its end."""
+    monkeypatch.setattr("safe_rl.runs.writing.RunWriter.draw_curves", drawing)
+
+
 @pytest.fixture
 def registrations_undone():
     """For tests that register elements, tasks, costs, observations or robots."""

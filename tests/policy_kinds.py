@@ -103,7 +103,6 @@ class Number(nn.Module):
 KINDS = {
     "normal": (4, NormalParamExtractor(), ["loc", "scale"], IndependentNormal),
     "number": (2, Number(), ["loc", "scale"], Normal),
-    "tanh_normal": (4, NormalParamExtractor(), ["loc", "scale"], TanhNormal),
     "bounded_tanh_normal": (
         4, NormalParamExtractor(), ["loc", "scale"],
         functools.partial(TanhNormal, low=-2.0, high=3.0),

@@ -19,7 +19,7 @@ from safe_rl.files import (
     replacing,
     save_tensors,
 )
-from safe_rl.reporting.archive import read_archive
+from safe_rl.reporting import archive
 from safe_rl.runs import table
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.run import Run, find_runs
@@ -132,12 +132,12 @@ def test_a_table_of_any_size_and_a_pipe_are_not_read(tmp_path):
         check_no_links(tmp_path)
 
 
-def test_what_unpacks_to_more_than_an_archive_has_is_refused(tmp_path):
+def test_what_unpacks_to_more_than_an_archive_has_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "_MOST_BYTES", 2_000_000)
     with gzip.open(tmp_path / "runs.json.gz", "wb") as file:
-        for _ in range(300):
-            file.write(b" " * 1_000_000)
-    with pytest.raises(ValueError, match="more than 200,000,000 bytes"):
-        read_archive(tmp_path)
+        file.write(b" " * 3_000_000)
+    with pytest.raises(ValueError, match="more than 2,000,000 bytes"):
+        archive.read_archive(tmp_path)
 
 
 def test_a_table_of_more_columns_than_a_run_has_is_refused(tmp_path):

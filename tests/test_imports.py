@@ -1,22 +1,12 @@
 """Imports point one way, as `.importlinter` says, and what is slow to import comes late."""
 
-from importlib import import_module
-
 import pytest
 from commands import ROOT, in_a_process
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
-LAZY = ["safe_rl", "safe_rl.envs", "safe_rl.envs.gymnasium", "safe_rl.envs.velocity"]
-
 
 def test_imports_point_one_way():
     assert lint_imports(str(ROOT / ".importlinter"), no_cache=True) == EXIT_STATUS_SUCCESS
-
-
-@pytest.mark.parametrize("package", [*LAZY, "safe_rl.evaluation"])
-def test_what_is_imported_later_is_listed_at_once(package):
-    module = import_module(package)
-    assert {name for name in dir(module) if not name.startswith("__")} == set(module.__all__)
 
 
 def test_importing_the_package_takes_no_time_and_imports_neither_torch_nor_its_parts():

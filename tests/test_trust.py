@@ -10,7 +10,6 @@ from omegaconf import OmegaConf
 
 from safe_rl import trust
 from safe_rl.algorithms import MinibatchUpdate
-from safe_rl.checks import SettingError
 from safe_rl.trust import TargetError, instantiate, locate
 
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 0.1}
@@ -173,22 +172,3 @@ def test_modules_named_by_the_user_are_reached_but_not_what_they_borrow(users):
         TargetError, match=r"'users_module' has no attribute 'Lose'\. Did you mean 'Loss'"
     ):
         locate("users_module.Lose")
-
-
-def test_errors_name_the_full_key():
-    config = OmegaConf.create(
-        {
-            "lagrangian": {"_target_": "safe_rl.objectives.LagrangeMultiplier", "lrr": 1.0},
-            "policy_update": {
-                "_target_": "safe_rl.algorithms.MinibatchUpdate",
-                "adapt_rate": {"_target_": "safe_rl.algorithms.KLAdaptiveRate", "factor": 1.1},
-            },
-        }
-    )
-    with pytest.raises(SettingError, match=r"^lagrangian\.lrr: .*Did you mean 'lr'"):
-        instantiate(config.lagrangian, cost_limits={"cost": 1.0})
-    with pytest.raises(SettingError, match=r"^policy_update\.adapt_rate: .*lowest"):
-        instantiate(config.policy_update)
-    config.lagrangian = {"_target_": config.lagrangian._target_, "init": True, "lr": 1.0}
-    with pytest.raises(SettingError, match=r"^lagrangian\.init=true: it must be"):
-        instantiate(config.lagrangian, cost_limits={"cost": 1.0})

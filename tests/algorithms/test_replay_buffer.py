@@ -7,12 +7,10 @@ import pytest
 import torch
 from scipy import stats
 from tensordict import TensorDict
-from torchrl.data import Bounded
-from torchrl.objectives import ValueEstimators
 
 from safe_rl.algorithms import Memory, ReplayUpdate
-from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
-from safe_rl.objectives import SACLoss, TD3Loss
+from safe_rl.models import QEnsemble, make_squashed_actor
+from safe_rl.objectives import SACLoss
 
 IN_KEYS = [
     *("observation", "action"),
@@ -105,8 +103,9 @@ def test_sums_may_have_discounts_of_their_own():
             memory.extend(make_batch(first, 4, ends=[5]))
     for memory in (plain, own, copy):
         memory.end_rows()
-    for observation, step in all_of(plain).items():
-        for other in (all_of(own)[observation], all_of(copy)[observation]):
+    expected, *found = (all_of(memory) for memory in (plain, own, copy))
+    for observation, step in expected.items():
+        for other in (each[observation] for each in found):
             time, length = observation % 1000, int(step["steps_to_next_obs"])
             cost = sum(0.9**i * (100 + time + i) for i in range(length))
             assert other["next", "cost"].item() == pytest.approx(cost)
@@ -220,16 +219,6 @@ def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
     check_draws(memory, copy, make_batch(10, 5, rows=1))
 
 
-def test_a_buffer_of_torchrl_passes_errors_to_the_sampler():
-    buffer = make_memory(capacity=9, prioritised={"alpha": 0.5, "beta": 1.0})._buffer
-    buffer.extend(make_batch(0, 4, rows=1).reshape(-1))
-    drawn = buffer.sample(64)
-    buffer.update_tensordict_priority(drawn.set("td_error", drawn["observation"]))
-    buffer.add(make_batch(4, 1, rows=1)[0, 0])
-    found = buffer.sampler.state_dict()["_priorities"][:5]
-    assert found.numpy() == pytest.approx(np.sqrt([0, 1, 2, 3, 3]), abs=1e-3)
-
-
 def test_errors_are_read_where_the_loss_writes_them():
     actor = make_squashed_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
     q = QEnsemble(1, 1, hidden_sizes=[8], num_networks=2)
@@ -243,26 +232,6 @@ def test_errors_are_read_where_the_loss_writes_them():
     update(memory, 1)
     # the rewards of these steps differ, and so do the errors
     assert next(memory.minibatches(1))["priority_weight"].unique().numel() > 1
-
-
-def make_td3(gamma):
-    actor = make_bounded_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
-    q = QEnsemble(1, 1, hidden_sizes=[8], num_networks=2)
-    settings = {"policy_noise": 0.0, "noise_clip": 0.5, "action_spec": Bounded(-1, 1, [1])}
-    return TD3Loss(actor, q, gamma=gamma, **settings)
-
-
-def test_an_update_that_is_resumed_discounts_as_it_is_told():
-    def update_of(loss):
-        sgd = partial(torch.optim.SGD, lr=0.0)
-        return ReplayUpdate(loss, optimizer=sgd, updates_per_step=1.0, tau=0.1)
-
-    before, resumed = make_td3(0.9), make_td3(0.1)
-    update_of(resumed).load_state_dict(update_of(before).state_dict())
-    before.make_value_estimator(ValueEstimators.TD0, gamma=0.1)
-    steps = make_batch(0, 5, terminates=False).reshape(-1)
-    losses = [loss.critic_losses(steps.clone())["loss_qvalue"] for loss in (resumed, before)]
-    torch.testing.assert_close(*losses)
 
 
 @pytest.mark.parametrize("exponents", [{"alpha": 0.6}, {"alpha": 0.6, "beta": 0.4, "eps": 1.0}])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
+from torchrl.objectives import ValueEstimators
 
 from safe_rl.algorithms import Memory, PolicyUpdate, ReplayUpdate
 from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
@@ -27,14 +28,14 @@ def make_update(seed, tau=0.1, **keys):
     return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=tau, **keys)
 
 
-def make_td3(device="cpu", kind=TD3Loss, **keys):
+def make_td3(device="cpu", kind=TD3Loss, gamma=0.9, **keys):
     """A TD3 update without noise, so that nothing in its steps is random."""
     torch.manual_seed(0)
     spec = Bounded(-1, 1, [2])
     loss = kind(
         make_bounded_actor(3, spec.low, spec.high, hidden_sizes=[8]),
         QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
-        **{"action_spec": spec, "gamma": 0.9, "policy_noise": 0.0, "noise_clip": 0.5},
+        **{"action_spec": spec, "gamma": gamma, "policy_noise": 0.0, "noise_clip": 0.5},
     ).to(device)
     adam = partial(torch.optim.Adam, lr=0.01)
     return ReplayUpdate(loss, optimizer=adam, updates_per_step=1, tau=0.1, **keys)
@@ -94,6 +95,15 @@ def test_a_loaded_update_goes_on_as_the_saved_one(memory):
     ):
         assert trained.equal(others[0]), name
         assert target.equal(others[1]), name
+
+
+def test_an_update_that_is_resumed_discounts_as_it_is_told(memory):
+    before, resumed = make_td3(), make_td3(gamma=0.1)
+    resumed.load_state_dict(before.state_dict())
+    before.loss.make_value_estimator(ValueEstimators.TD0, gamma=0.1)
+    steps = next(memory.minibatches(1))
+    losses = [each.loss.critic_losses(steps.clone())["loss_qvalue"] for each in (resumed, before)]
+    torch.testing.assert_close(*losses)
 
 
 def test_a_checkpoint_of_before_the_first_update_is_whole(memory):

@@ -216,31 +216,24 @@ def test_the_gradient_of_a_chance_in_closed_form():
 def train(directory, *overrides, **settings):
     """A run of a second on the point mass."""
     limits = "cost_limits={cost_hazards: 2, cost_north: 1}"
-    trainer = point_mass_trainer(directory, limits, *overrides, **settings)
+    trainer = point_mass_trainer(directory, limits, "frames=320", *overrides, **settings)
     trainer.run()
     return trainer, read_table(directory / "progress.csv")
 
 
-@pytest.mark.parametrize(
-    ("algo", "risk"),
-    [("ppo_lagrangian", "cvar"), ("cpo", "chance"), ("p3o", "chance"), ("crpo", "cvar")],
-)
+@pytest.mark.parametrize(("algo", "risk"), [("ppo_lagrangian", "cvar"), ("cpo", "chance")])
 def test_every_algorithm_takes_it(tmp_path, algo, risk):
-    size = 40 if algo in ("ppo_lagrangian", "p3o") else None
-    extra = ["risk.ramp_start=0", "risk.ramp_steps=0", "risk.tail=0.25"] if risk == "cvar" else []
+    size = 40 if algo == "ppo_lagrangian" else None
+    extra = ["risk.ramp_start=0", "risk.ramp_steps=0", "risk.tail=0.25", "limits.drift=null"]
+    extra = extra if risk == "cvar" else []
     trainer, table = train(tmp_path, f"algo={algo}", f"risk={risk}", *extra, minibatch_size=size)
     assert trainer.algorithm.cost_advantage.reward_keys == [PENALISED_COSTS]
     for key, limit in (("cost_hazards", 2), ("cost_north", 1)):
         held = limit if risk == "cvar" else 0.1 * limit
         expected = [estimate - held for estimate in table[f"estimate_{key}"]]
         assert table[f"violation_{key}"] == pytest.approx(expected, abs=1e-5)
-
-
-def test_a_tail_costs_more_than_the_mean(tmp_path):
-    extra = ["risk.ramp_start=0", "risk.ramp_steps=0", "risk.tail=0.25", "limits.drift=null"]
-    _, table = train(tmp_path, "algo=ppo_lagrangian", "risk=cvar", *extra)
     pairs = zip(table["estimate_cost_hazards"], table["episode_cost_hazards"], strict=True)
-    assert all(tail > mean for tail, mean in pairs if mean > 0)
+    assert risk == "chance" or all(tail > mean for tail, mean in pairs if mean > 0)
 
 
 def test_errors_of_a_controller_are_in_units_of_the_measures_limit(tmp_path):

@@ -63,6 +63,7 @@ def test_other_precisions_are_torchs_own(dtype):
     assert torch.equal(QUICK(x), x.tanh())
 
 
+@pytest.mark.long
 def test_it_compiles():
     x = torch.randn(7, 3, requires_grad=True)
     compiled = torch.compile(QUICK, backend="aot_eager", fullgraph=True)

@@ -1,4 +1,4 @@
-"""The dual of CPO by bounds on all steps, by the two-branch formula for k = 1, and at its edges."""
+"""The dual of CPO by bounds on all steps, and at its edges."""
 
 import numpy as np
 import pytest
@@ -62,49 +62,6 @@ def test_steps_are_optimal_and_what_is_called_infeasible_is(num_costs):
     np.testing.assert_allclose(lost[found], 0, atol=1e-5)
     assert 0 < (~found).sum() < len(g) / 2
     assert set(solution.case.tolist()) == {0, 1, 2, 3}
-
-
-def textbook_dual(q, r, s, c):
-    """λ, ν and case for one constraint, by the two branches of the spec of CPO."""
-    a, b = q - r**2 / s, 2 * DELTA - c**2 / s
-    if b < 0:
-        return (0.0, np.sqrt(2 * DELTA / s), 0) if c >= 0 else (np.sqrt(q / (2 * DELTA)), 0.0, 3)
-
-    def on_a(lam):
-        return -0.5 * (a / lam + b * lam) - r * c / s
-
-    def on_b(lam):
-        return -0.5 * (q / lam + 2 * DELTA * lam)
-
-    edge, top = r / c, 1e12
-    # Λ_a = {λc − r > 0} and Λ_b = {λc − r ≤ 0} as intervals of λ ≥ 0.
-    if c < 0:
-        interval_a, interval_b = (0, edge), (max(edge, 0), top)
-    else:
-        interval_a, interval_b = (max(edge, 0), top), (0, edge)
-    candidates = []
-    for value, optimum, (low, high) in (
-        (on_a, np.sqrt(a / b), interval_a), (on_b, np.sqrt(q / (2 * DELTA)), interval_b)
-    ):  # fmt: skip
-        if high > low:
-            lam = np.clip(optimum, low, high)
-            candidates.append((value(max(lam, 1e-12)), lam))
-    lam = max(candidates)[1]
-    return lam, max(0, lam * c - r) / s, 2 if c < 0 else 1
-
-
-def test_one_constraint_against_the_two_branches_of_the_dual():
-    g, b, c = random_problems(5000, 1, seed=7)
-    solution, _ = solve(g, b, c)
-    q, r = (g * g).sum(-1), (g * b[:, 0]).sum(-1)
-    s = (b[:, 0] ** 2).sum(-1)
-    expected = [textbook_dual(*problem) for problem in zip(q, r, s, c[:, 0], strict=True)]
-    lam, nu, case = map(np.array, zip(*expected, strict=True))
-    assert np.bincount(case).tolist() == np.bincount(solution.case).tolist()
-    assert (np.bincount(case) > 300).all()
-    np.testing.assert_array_equal(solution.case, case)
-    np.testing.assert_allclose(solution.lam, lam, rtol=1e-6)
-    np.testing.assert_allclose(solution.nu[:, 0], nu, rtol=1e-6, atol=1e-8)
 
 
 def one_problem(g, b, c):

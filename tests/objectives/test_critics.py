@@ -49,6 +49,7 @@ def test_explained_variance_by_hand():
     assert explained_variance(prediction, target).tolist() == [1.0, 0.0, 0.0]
 
 
+@pytest.mark.long
 def test_it_compiles():
     torch._dynamo.reset()
     loss, batch = CriticLoss(make_critic(), make_critic("cost_value", 2)), make_targets([8], 2)

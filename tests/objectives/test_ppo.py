@@ -1,10 +1,8 @@
-"""PPO losses against TorchRL's PPO and loops written from the definition."""
+"""PPO losses against loops written from the definition."""
 
 import pytest
 import torch
-import torch._dynamo.testing
 from samples import limit_state, make_actor, make_batch, perturb
-from torchrl.objectives import ClipPPOLoss
 
 from safe_rl.objectives.multipliers import LagrangeMultiplier
 from safe_rl.objectives.policy_losses import PPOLagrangianLoss, PPOLoss
@@ -20,24 +18,6 @@ def make_lagrangian(actor, init=(0.5, 2.0), limits=LIMITS, **settings):
 
 def gradient(loss, actor):
     return torch.autograd.grad(loss, list(actor.parameters()))
-
-
-@pytest.mark.parametrize("batch_size", [[64], [4, 16]])
-def test_plain_ppo_agrees_with_torchrl(batch_size):
-    actor = make_actor()
-    batch = make_batch(actor, batch_size, num_costs=0)
-    perturb(actor, 0.2)
-    theirs = ClipPPOLoss(actor, None, critic_coeff=None, **SETTINGS)
-    theirs.set_keys(sample_log_prob="action_log_prob")
-    expected = theirs(batch.clone())
-    losses = PPOLoss(actor, **SETTINGS)(batch)
-    for key in ("loss_objective", "loss_entropy", "entropy", "clip_fraction"):
-        torch.testing.assert_close(losses[key], expected[key])
-    if len(batch_size) == 1:
-        torch.testing.assert_close(losses["ESS"], expected["ESS"])
-    assert losses["clip_fraction"] > 0
-    ours = gradient(losses["loss_objective"], actor)
-    torch.testing.assert_close(ours, gradient(expected["loss_objective"], actor))
 
 
 @pytest.mark.parametrize("clipping", ["none", "pessimistic", "joint"])
@@ -78,14 +58,17 @@ def test_an_action_that_has_become_impossible_leaves_the_gradient_to_the_others(
     torch.testing.assert_close(found, gradient(loss(batch)["loss_objective"], actor))
 
 
+@pytest.mark.long
 def test_compiles_in_one_graph_that_is_never_recompiled():
+    from torch._dynamo.testing import CompileCounterWithBackend
+
     torch._dynamo.reset()
     actor = make_actor()
     batch = make_batch(actor, [64], 2)
     perturb(actor)
     loss = make_lagrangian(actor)
     loss.prepare(batch, limit_state(0.0, 0.0))
-    counter = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    counter = CompileCounterWithBackend("aot_eager")
     compiled = torch.compile(loss, fullgraph=True, backend=counter)
     for epoch in range(4):
         losses = compiled(batch)

@@ -161,7 +161,13 @@ def test_what_is_compressed_is_refused_before_it_fills_the_memory(tmp_path):
     refuse(tmp_path / "a.torchrl", "compressed parts")
 
 
-@pytest.mark.parametrize("content", [[], None, {}, {"facts": {}}, {"facts": 3, "parts": {}}])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *([], None, {}, {"facts": {}}, {"facts": 3, "parts": {}}),
+        *({"facts": [], "parts": {}}, {"facts": {}, "parts": []}),
+    ],
+)
 def test_a_file_that_is_no_checkpoint_is_refused_and_stops_no_run(tmp_path, content):
     store = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=2)
     store.save_best(10, 1.0)

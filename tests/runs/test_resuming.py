@@ -118,13 +118,13 @@ point_mass_trainer = partial(trainer_of_point_mass, num_steps=27)
 @pytest.mark.parametrize("kind", [PointMass, Forgetful])
 def test_a_run_without_a_checkpoint_starts_over(kind, tmp_path, monkeypatch):
     monkeypatch.setattr("point_mass_runs.PointMass", kind)
-    whole = point_mass_trainer(tmp_path / "whole")
+    whole = point_mass_trainer(tmp_path / "whole", "frames=480")
     whole.run()
-    begun = point_mass_trainer(tmp_path / "begun")
+    begun = point_mass_trainer(tmp_path / "begun", "frames=480")
     with begun.writer.writing():
         begun._checkpoints.begin()
         begun.writer.add(begun.epoch(begun.batches()))
-    again = point_mass_trainer(tmp_path / "begun")
+    again = point_mass_trainer(tmp_path / "begun", "frames=480")
     assert again.writer.run.has_begun
     again.resume()
     again.run()
@@ -182,13 +182,13 @@ def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
 
 def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     paper = "limits=null"  # a descent would depend on the frames of a run
-    point_mass_trainer(tmp_path / "whole", paper).run()
+    point_mass_trainer(tmp_path / "whole", paper, "frames=800").run()
     point_mass_trainer(tmp_path / "run", paper, "frames=640", "checkpoint.interval=0").run()
     older, newest = sorted((tmp_path / "run/checkpoints/last").iterdir())
     newest.write_bytes(newest.read_bytes()[:-100])
     assert is_finished(Run(tmp_path / "run").checkpoints("last"), 480)
     assert not is_finished(Run(tmp_path / "run").checkpoints("last"), 640)
-    trainer = point_mass_trainer(tmp_path / "run", paper)
+    trainer = point_mass_trainer(tmp_path / "run", paper, "frames=800")
     with pytest.warns(UserWarning, match=f"{newest.name}.*older {older.name}"):
         trainer.resume()
     assert trainer.progress.steps == 480
@@ -208,8 +208,8 @@ def test_a_table_that_lacks_epochs_is_refused(tmp_path):
 
 
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):
-    point_mass_trainer(tmp_path).run()
-    check_same_run(point_mass_config(), Run(tmp_path))
+    point_mass_trainer(tmp_path, "frames=160").run()
+    check_same_run(point_mass_config("frames=160"), Run(tmp_path))
     longer, other = point_mass_config("frames=9000", "num_threads=2"), point_mass_config("seed=1")
     check_same_run(longer, Run(tmp_path))
     with pytest.raises(ValueError, match=r"seed: 0 -> 1.*hydra.sweep.dir"):

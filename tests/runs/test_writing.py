@@ -65,7 +65,7 @@ def test_final_figures_without_any_episode_are_nan():
     assert math.isnan(final_figures(table, [])["episode_return"])
 
 
-def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
+def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys, curves):
     config = compose_config("env=PointMass", "cost_limits={cost: 25, cost_north: 5}", "frames=1500",
                             "frames_per_batch=1000")  # fmt: skip
     writer = RunWriter(Run(tmp_path / "run"), config, {"cost": 25.0, "cost_north": 5.0}, 1000)
@@ -88,6 +88,18 @@ def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys):
     assert "λ=0.5" in bar
     assert "2.00k/2.00k" in bar
     assert "nan" not in bar
+
+
+def test_a_picture_that_cannot_be_drawn_ends_no_run(tmp_path, capsys, curves, monkeypatch):
+    import matplotlib
+
+    monkeypatch.setitem(matplotlib.rcParams, "text.usetex", True)
+    monkeypatch.setenv("PATH", str(tmp_path))  # without LaTeX
+    writer = RunWriter(Run(tmp_path), compose_config("env=PointMass", "logger=none"), {}, 1000)
+    with writer.writing():
+        writer.add(row(1, 1.0, 20.0))
+    writer.draw_curves()
+    assert "curves.png was not drawn: " in capsys.readouterr().err
 
 
 def test_a_risk_measure_is_what_is_held_against_the_limit(tmp_path, capsys):

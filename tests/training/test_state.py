@@ -13,24 +13,25 @@ from safe_rl.runs.table import read_table
 from safe_rl.training.state import EnvSnapshot, RandomGenerators, StopRequest
 
 
-def signal_in(trainer, epoch):
+def signal_in(trainer, epoch, number):
     """Let a signal come while an epoch is recorded."""
     record = trainer.writer.add
 
     def record_and_signal(row):
         record(row)
         if row["epoch"] == epoch:
-            signal.raise_signal(signal.SIGTERM)
+            signal.raise_signal(number)
 
     trainer.writer.add = record_and_signal
 
 
-def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path, number):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    signal_in(trainer, epoch=3)
-    handler = signal.getsignal(signal.SIGTERM)
+    signal_in(trainer, 3, number)
+    before = signal.signal(number, signal.SIG_DFL)  # nohup ignores SIGHUP
     trainer.run()
-    assert signal.getsignal(signal.SIGTERM) is handler
+    assert signal.signal(number, before) is signal.SIG_DFL
     assert read_table(tmp_path / "progress.csv")["epoch"] == [1, 2, 3]
     assert [path.name for path in (tmp_path / "checkpoints" / "last").iterdir()] == [
         "checkpoint-000000000480.torchrl"

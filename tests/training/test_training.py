@@ -5,7 +5,6 @@ import math
 from statistics import fmean
 
 import pytest
-import torch
 from point_mass_runs import point_mass_trainer
 from run_configs import assert_resumes_exactly, without_times
 
@@ -41,14 +40,6 @@ LEARNING = [
 
 
 @pytest.mark.long
-def test_ppo_learns_and_pays_the_cost(tmp_path):
-    _, table = train(tmp_path, *LEARNING, "algo=ppo", "cost_limits={cost_hazards: 1.0}")
-    assert table["episode_return"][-1] > table["episode_return"][0] + 0.5
-    assert table["episode_cost_hazards"][-1] > 3.0
-    assert not any("multiplier" in name or "cost_critic" in name for name in table)
-
-
-@pytest.mark.long
 def test_ppo_lagrangian_keeps_the_limits(tmp_path):
     limits = {"cost_hazards": 1.0, "cost_north": 1.0}
     _, table = train(
@@ -72,10 +63,11 @@ def test_ppo_lagrangian_keeps_the_limits(tmp_path):
 
 def test_the_same_seed_gives_the_same_table_but_for_times(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
-    train(first)
-    train(second)
+    _, table = train(first, "frames=200")
+    assert table["steps"] == [160, 320]  # whole batches
+    train(second, "frames=200")
     assert without_times(first / "progress.csv") == without_times(second / "progress.csv")
-    train(tmp_path / "other", "seed=1")
+    train(tmp_path / "other", "frames=200", "seed=1")
     assert without_times(first / "progress.csv") != without_times(tmp_path / "other/progress.csv")
 
 
@@ -134,7 +126,7 @@ def test_the_folder_of_a_run(tmp_path):
     trainer = point_mass_trainer(tmp_path, "checkpoint.interval=0", "cost_limits={cost: 1000}")
     line = trainer.run()
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
-    assert {"config.yaml", "progress.csv", "curves.png"} <= names
+    assert {"config.yaml", "progress.csv"} <= names
     assert {name for name in names if name.startswith("checkpoints/last/")} == {
         "checkpoints/last/checkpoint-000000001120.torchrl",
         "checkpoints/last/checkpoint-000000001280.torchrl",
@@ -158,6 +150,7 @@ def test_the_folder_of_a_run(tmp_path):
     )
     assert {"actor", "critic", "cost_critic", "multiplier"} <= kept
     assert last - kept >= {"policy_update", "critic_update", "env", "accounting", "rng"}
+    assert "losses" not in last  # those of the package remember nothing
     assert line.startswith("Return ")
     assert line.endswith(str(tmp_path))
 
@@ -167,8 +160,9 @@ def test_nothing_is_best_while_a_limit_is_broken(tmp_path):
     assert not (tmp_path / "checkpoints" / "best").exists()
 
 
-def test_epochs_without_a_finished_episode(tmp_path):
+def test_epochs_without_a_finished_episode(tmp_path, curves):
     _, table = train(tmp_path, "limits=null", "staggered_starts=null", num_steps=100)
+    assert (tmp_path / "curves.png").is_file()
     # 40 steps per environment and epoch, episodes of 100 steps
     known = [not math.isnan(value) for value in table["episode_cost"]]
     assert known == [False, False, True, False, True, False, False, True]
@@ -280,20 +274,6 @@ def test_batches_of_whole_episodes_are_judged_by_those(tmp_path):
     table = train_own_update(tmp_path, "cost_limits={cost: 5}", num_steps=40)
     expected = [cost - 5 for cost in table["episode_cost"]]
     assert table["policy_violation_cost"] == pytest.approx(expected, rel=1e-6)
-
-
-def test_frames_are_rounded_up_to_whole_batches(tmp_path):
-    _, table = train(tmp_path, "frames=200")
-    assert table["steps"] == [160, 320]
-
-
-def test_diverged_training_says_so(tmp_path):
-    trainer = point_mass_trainer(tmp_path)
-    with torch.no_grad():
-        for parameter in trainer.algorithm.critic.parameters():
-            parameter.fill_(torch.nan)
-    with pytest.raises(FloatingPointError, match="training has diverged"):
-        trainer.run()
 
 
 def test_staggered_starts_let_episodes_end_in_every_batch(tmp_path):
