@@ -45,36 +45,6 @@ class Walk(gymnasium.Env):
 gymnasium.register("Walk-v0", entry_point=f"{__name__}:Walk", max_episode_steps=25)
 
 
-class Cliff(gymnasium.Env):
-    """Along a cliff to the other end of a grid: the row beside it costs, falling leads back.
-
-    The way along the cliff is the shortest, a return of 4 at a cost of 5; one row further inland it
-    is 2 at a cost of 2. Every limit in between is met best by a mixture of the two.
-    """
-
-    LENGTH, ROWS = 5, 3
-    action_space = gymnasium.spaces.Discrete(4)  # ahead, back, inland, towards the cliff
-    observation_space = gymnasium.spaces.Discrete(LENGTH * ROWS)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.place, self.row = 0, 0
-        return 0, {}
-
-    def step(self, action):
-        ahead, inland = [(1, 0), (-1, 0), (0, 1), (0, -1)][int(action)]
-        self.place = max(self.place + ahead, 0)
-        self.row = min(self.row + inland, self.ROWS - 1)
-        fell = self.row < 0
-        arrived = self.place == self.LENGTH and self.row == 0
-        self.place, self.row = min(self.place, self.LENGTH - 1), max(self.row, 0)
-        if fell:
-            self.place = 0
-        cost = float(self.row == 0)
-        reward = 9.0 * arrived - 5.0 * fell - 1.0
-        return self.place + self.LENGTH * self.row, reward, arrived, False, {"cost": cost}
-
-
 class Boxes(gymnasium.Env):
     """Two choices at once; each has its own reward and cost, and one of them counts from 1."""
 
@@ -127,5 +97,4 @@ def make_pendulum(**kwargs):
 
 
 gymnasium.register("Recall-v0", entry_point=f"{__name__}:Recall", max_episode_steps=8)
-gymnasium.register("Cliff-v0", entry_point=f"{__name__}:Cliff", max_episode_steps=30)
 gymnasium.register("Boxes-v0", entry_point=f"{__name__}:Boxes", max_episode_steps=10)

@@ -1,13 +1,13 @@
 """Configurations composed as the command line composes them, for tests without it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.cli.config  # noqa: F401, Hydra's ConfigStore gets the general keys
 from safe_rl.envs import store_configs
@@ -19,6 +19,14 @@ store_configs()
 ConfigStore.instance().store(
     group="env", name="PointMass", node={"name": "PointMass", "robot_base": "point"}
 )
+
+
+def nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Full paths of a configuration's mappings, from outside to inside."""
+    for key, value in node.items():
+        if OmegaConf.is_dict(value) and key != "env":
+            yield f"{path}{key}", value
+            yield from nodes(value, f"{path}{key}.")
 
 
 def compose_config(*overrides: str) -> DictConfig:

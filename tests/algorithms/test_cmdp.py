@@ -105,12 +105,6 @@ def trpo(actor, cmdp):
     return lambda batch, _mean_costs: step(batch)
 
 
-def trpo_lagrangian(actor, cmdp):
-    multiplier = LagrangeMultiplier(cmdp.cost_limits, init=1.0, lr=0.08)
-    loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
-    return dual_ascent(multiplier, TRPOStep(loss, **TRUST_REGION))
-
-
 def trpo_pid(actor, cmdp):
     multiplier = pid_multiplier(cmdp)
     loss = TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0)
@@ -195,7 +189,6 @@ UNCONSTRAINED = [ppo, trpo]
 CONSTRAINED = [
     (ppo_lagrangian, 250),
     (ppo_pid, 120),
-    (trpo_lagrangian, 200),
     (trpo_pid, 120),
     (cpo, 100),
     (p3o, 120),
@@ -210,13 +203,12 @@ CONSTRAINED = [
 ]
 
 
-@pytest.mark.parametrize("cmdp", [ONE, TWO], ids=["one", "two"])
 @pytest.mark.parametrize("algorithm", UNCONSTRAINED)
-def test_unconstrained_algorithms_reach_the_target_and_violate(algorithm, cmdp):
+def test_unconstrained_algorithms_reach_the_target_and_violate(algorithm):
     actor = make_actor()
-    mean = train(cmdp, actor, algorithm(actor, cmdp), epochs=60)[-20:].mean(0)
+    mean = train(ONE, actor, algorithm(actor, ONE), epochs=60)[-20:].mean(0)
     torch.testing.assert_close(mean, TARGET, atol=0.05, rtol=0)
-    assert (cmdp.expected_costs(mean) > 1.5 * cmdp.limits).all()
+    assert (ONE.expected_costs(mean) > 1.5 * ONE.limits).all()
 
 
 # Two limits take as long again: but for one algorithm of each kind that is a slow test.
@@ -241,14 +233,7 @@ def test_constrained_algorithms_reach_the_boundary_at_the_optimum(algorithm, epo
 
 # Gradient steps of a multiplier circle round the optimum of a linear programme for ever, so that
 # there are none of them here.
-CHOICES = [
-    (ONE_OF_THREE, trpo_pid),
-    *(
-        (problem, algorithm)
-        for problem in (ONE_OF_THREE, TWO_COMPONENTS)
-        for algorithm in (cpo, p3o)
-    ),
-]
+CHOICES = [(ONE_OF_THREE, trpo_pid), (TWO_COMPONENTS, cpo), (TWO_COMPONENTS, p3o)]
 
 
 @pytest.mark.parametrize(("problem", "algorithm"), CHOICES)

@@ -4,18 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium_envs import make_pendulum
 from run_configs import compose_config
 from torchrl.checkpoint import CheckpointError
 
 import safe_rl
 from safe_rl.algorithms import OffPolicy
-from safe_rl.collectors import (
-    Recording,
-    read_columns,
-    read_recording,
-    safety_gymnasium_columns,
-)
+from safe_rl.collectors import Recording, read_columns, read_recording, safety_gymnasium_columns
 from safe_rl.envs import make_env
 
 h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
@@ -38,12 +32,10 @@ class Battery(gymnasium.Env):
 
 
 gymnasium.register("Battery-v0", entry_point=f"{__name__}:Battery", max_episode_steps=10)
-gymnasium.register("Swing-v0", entry_point=make_pendulum)
 
 GYMNASIUM = {"env": "gymnasium", "env.id": "Battery-v0"}
 FAMILIES = {
     "bounds [0, 2]": ("Battery-v0", GYMNASIUM, 0.5),
-    "pendulum": ("Swing-v0", {"env": "gymnasium", "env.id": "Swing-v0", "env.num_steps": 200}, 1.4),
     "velocity": ("SafeHumanoidVelocity-v0", {"env": "SafeHumanoidVelocity"}, 0.3),
     "safety gym": ("Safexp-PointGoal1-v0", {"env": "PointGoal1", "env.num_steps": 200}, 0.6),
 }

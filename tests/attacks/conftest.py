@@ -5,6 +5,10 @@ from pathlib import Path
 import pytest
 
 
+def pytest_ignore_collect(config):
+    return "not attacks" in config.option.markexpr or None
+
+
 def pytest_collection_modifyitems(items):
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent):

@@ -114,46 +114,6 @@ def test_a_sweep_that_is_killed_is_finished_by_the_same_command(tmp_path):
     assert len(whole) == 2
 
 
-HANGING = """
-import time
-import gymnasium
-from gymnasium_envs import Walk
-
-
-class Hanging(Walk):
-    def step(self, action):
-        if self.np_random.random() < 0.2:
-            print("hangs", flush=True)
-            time.sleep(10_000)
-        return super().step(action)
-
-
-gymnasium.register("Hanging-v0", Hanging, max_episode_steps=25)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_second_signal_ends_a_run_whose_environment_hangs(number, tmp_path):
-    (tmp_path / "hanging.py").write_text(HANGING)
-    process = start(
-        *("train.py", f"import={tmp_path / 'hanging.py'}", "env=gymnasium", "env.id=Hanging-v0"),
-        *("env.cost_keys=[fast]", "cost_limits={fast: 3}", "num_envs=2", "frames_per_batch=200"),
-        *("frames=2000", "logger=none", f"hydra.run.dir={tmp_path / 'run'}"),
-        PYTHONPATH=os.pathsep.join(["tests", os.environ.get("PYTHONPATH", "")]),
-    )
-    try:
-        for line in process.stdout:
-            if "hangs" in line:
-                break
-        for _ in range(2):
-            os.kill(process.pid, number)
-            time.sleep(1)
-        process.wait(60)
-        assert process.returncode != 0
-    finally:
-        kill_all(process)
-
-
 def test_a_clock_that_jumps_back_changes_no_number(tmp_path, monkeypatch):
     words = [*RUN, *PROBLEMS[0], "frames=400", "certificate.episodes=0", "logger=tensorboard"]
     begin_or_continue(tmp_path / "usual", words)

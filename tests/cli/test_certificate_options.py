@@ -8,27 +8,21 @@ from safe_rl.runs.identity import is_to_keep_limits
 
 
 @pytest.mark.parametrize(
-    ("overrides", "share"),
+    ("overrides", "share", "tail"),
     [
-        ([], 1.0),
-        (["risk=cvar"], 1.0),
-        (["risk=chance"], 0.1),
-        (["risk=chance", "risk.most_over=0.2"], 0.2),
-        (["risk=chance", "certificate.most_over=0.05"], 0.05),
-        (["certificate.most_over=0.3"], 0.3),
+        ([], 1.0, 1.0),
+        (["risk=cvar"], 1.0, 0.1),
+        (["risk=chance"], 0.1, 1.0),
+        (["risk=chance", "risk.most_over=0.2"], 0.2, 1.0),
+        (["risk=chance", "certificate.most_over=0.05"], 0.05, 1.0),
+        (["certificate.most_over=0.3"], 0.3, 1.0),
+        (["algo=wcsac"], 1.0, 0.5),
+        (["algo=wcsac", "risk=mean"], 1.0, 1.0),
     ],
 )
-def test_a_limit_on_the_share_of_episodes_is_certified_with_the_mean(overrides, share):
-    options = certificate_options(compose_config("algo=cpo", *overrides))
-    assert options.most_over == share
-
-
-@pytest.mark.parametrize(
-    ("overrides", "tail"),
-    [([], 1.0), (["risk=cvar"], 0.1), (["algo=wcsac"], 0.5), (["algo=wcsac", "risk=mean"], 1.0)],
-)
-def test_a_limit_on_the_costliest_episodes_is_certified_for_them(overrides, tail):
-    assert certificate_options(compose_config(*overrides)).tail == tail
+def test_limits_on_shares_and_costliest_episodes_are_certified(overrides, share, tail):
+    options = certificate_options(compose_config(*overrides))
+    assert (options.most_over, options.tail) == (share, tail)
 
 
 @pytest.mark.parametrize(

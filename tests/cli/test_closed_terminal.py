@@ -3,13 +3,12 @@
 import os
 import pty
 import select
-import signal
 import subprocess
 import sys
 import termios
 
 import pytest
-from commands import ROOT, SMALL, in_a_process
+from commands import ROOT, SMALL
 
 from safe_rl.runs.table import read_table
 
@@ -46,14 +45,6 @@ def close_terminal(run, manner, *settings):
         process.wait()
 
 
-def test_training_ends_after_the_epoch_with_a_checkpoint(tmp_path):
-    status = close_terminal(tmp_path / "run", "SIG_DFL", "frames=1_000_000")
-    assert status == 128 + signal.SIGHUP
-    epochs = len(read_table(tmp_path / "run" / "progress.csv")["epoch"])
-    *_, last = sorted((tmp_path / "run" / "checkpoints" / "last").iterdir())
-    assert last.name == f"checkpoint-{40 * epochs:012d}.torchrl"
-
-
 def test_a_run_that_ignores_the_signal_is_certified(tmp_path):
     """Printing the outcome into the terminal that is gone ended it with status 1."""
     test = ["certificate.episodes=2", "certificate.ranking=2", "certificate.tests=1"]
@@ -76,17 +67,3 @@ def test_closed_streams_and_narrow_encodings_end_no_run(tmp_path):
     said = subprocess.run(words, cwd=ROOT, env=ascii_only, capture_output=True, text=True)
     assert "codec can't encode" not in said.stderr
     assert "mean_cost \\u2264" in said.stdout
-
-
-@pytest.mark.long
-def test_a_picture_that_cannot_be_drawn_ends_no_run(tmp_path):
-    (tmp_path / "matplotlibrc").write_text("text.usetex: True")
-    (tmp_path / "bin").mkdir()
-    (tmp_path / "bin" / "python").symlink_to(sys.executable)
-    said = in_a_process(
-        *("train.py", *SMALL, "frames=80", f"hydra.run.dir={tmp_path / 'run'}"),
-        MATPLOTLIBRC=str(tmp_path),
-        PATH=str(tmp_path / "bin"),  # without LaTeX
-    )
-    assert "curves.png was not drawn: " in said
-    assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 2

@@ -115,9 +115,8 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         before = GlobalHydra.instance().hydra
-        for seed in (0, 1):
-            run = safe_rl.train(algo="ppo", frames=40, seed=seed, **SMALL)
-            assert run.directory.match(f"runs/PointGoal1/ppo/*_seed{seed}")
+        run = safe_rl.train(algo="ppo", frames=40, seed=1, **SMALL)
+        assert run.directory.match("runs/PointGoal1/ppo/*_seed1")
         assert GlobalHydra.instance().hydra is before
         assert compose("config", overrides=["seed=7"]).seed == 7
     assert not GlobalHydra.instance().is_initialized()
@@ -328,17 +327,19 @@ def test_an_interrupted_run_is_resumed_to_the_same_table(run, tmp_path, monkeypa
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_a_run_shows_itself(tmp_path):
-    run = safe_rl.train("PointGoal1", directory=tmp_path / "run", frames=80, **SMALL)
+def test_a_run_shows_itself(run, tmp_path):
+    ignored = shutil.ignore_patterns("certificate*")
+    run = safe_rl.load(shutil.copytree(run.directory, tmp_path / "run", ignore=ignored))
     lines = repr(run).splitlines()
-    assert lines[0] == f"Run('{tmp_path / 'run'}'): ppo_lagrangian on PointGoal1"
+    assert lines[0] == f"Run('{tmp_path / 'run'}'): cpo on CarGoal1"
     assert lines[1].startswith("Return ")
     assert run.certificate is None
     frame = run.to_pandas()
-    assert list(frame["steps"]) == [40, 80]
+    assert list(frame["steps"]) == [40, 80, 120]
     assert list(frame.columns) == list(run.table)
-    titles = [axes.get_title() for axes in run.plot().axes]
-    assert titles == ["Return", "Episode cost", "Cost rate", "Multiplier"]
+    figure = run.plot()
+    figure.savefig(run.curves_file)
+    assert [axes.get_title() for axes in figure.axes] == ["Return", "Episode cost", "Cost rate"]
     page = run._repr_html_()
     assert page.startswith("<pre>Run(&#x27;")
     assert 'src="data:image/png;base64,' in page

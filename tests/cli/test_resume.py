@@ -1,5 +1,7 @@
 """resume=RUN: what may change in a run that is continued, and what its files cannot do."""
 
+import shutil
+
 import pytest
 from commands import composed
 from omegaconf import OmegaConf
@@ -10,7 +12,7 @@ from safe_rl.cli.config import check_settings
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
 
-NAMES = ("it's frames=10,num_envs=4", "a${oc.env:HOME}", "a\\'b", "ends with \\")
+NAMES = ("it's frames=10,num_envs=4 a${oc.env:HOME}", "a\\'b ends with \\")
 
 
 def begin(directory):
@@ -21,9 +23,14 @@ def begin(directory):
     return directory
 
 
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    return begin(tmp_path_factory.mktemp("begun") / "run")
+
+
 @pytest.fixture
-def run(tmp_path):
-    return begin(tmp_path / "run")
+def run(begun, tmp_path):
+    return shutil.copytree(begun, tmp_path / "run")
 
 
 def resumed(directory, *words):
@@ -33,8 +40,8 @@ def resumed(directory, *words):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_folders_may_have_any_name(tmp_path, name):
-    directory = begin(tmp_path / name)
+def test_folders_may_have_any_name(begun, tmp_path, name):
+    directory = shutil.copytree(begun, tmp_path / name)
     config = resumed(directory, "frames=3e5", "policy_update.max_kl=0.5")
     assert (config.frames, config.policy_update.max_kl) == (300_000, 0.5)
     assert config.hydra.run.dir == str(directory)
@@ -44,9 +51,8 @@ def test_folders_may_have_any_name(tmp_path, name):
 @pytest.mark.parametrize(
     "override",
     [
-        *("env.hazards_num=3", "env=CarGoal1", "seed=3", "num_envs=8", "hydra.run.dir=elsewhere"),
-        *("model.hidden_sizes=[8]", "+env.hazards_num=3", "cost_limits={cost: 3}", "+mine=3"),
-        *("init_from=elsewhere", "policy_update.optimizer.lr=1e-5", "lagrangian.init=3"),
+        *("env.hazards_num=3", "env=CarGoal1", "seed=3", "hydra.run.dir=elsewhere", "+mine=3"),
+        *("policy_update.optimizer.lr=1e-5", "lagrangian.init=3"),
         *("policy_update._target_=os.system", "collector=process", "hydra.nope=3"),
     ],
 )
@@ -60,9 +66,8 @@ def test_what_is_not_marked_as_changing_stays(run, override):
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        *(("frames", 9), ("num_threads", 3), ("checkpoint.interval", 3), ("compile", True)),
-        *(("loss.entropy_coeff", 0.1), ("lagrangian.kp", 0.5), ("critic_update.num_passes", 3)),
-        *(("seed", 0), ("num_envs", 4), ("model.hidden_sizes", [16])),  # as it was
+        *(("frames", 9), ("checkpoint.interval", 3), ("compile", True), ("lagrangian.kp", 0.5)),
+        ("model.hidden_sizes", [16]),  # as it was
     ],
 )
 def test_what_is_marked_may_change(run, key, value):

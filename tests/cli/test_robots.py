@@ -1,6 +1,8 @@
 """Runs with a robot of one's own find it again, wherever its files are and whatever is in them."""
 
+import contextlib
 import json
+import shutil
 import struct
 
 import pytest
@@ -49,20 +51,34 @@ def write_robot(folder, meshes="meshes", density=1):
     return path
 
 
-@pytest.fixture
-def run(tmp_path, monkeypatch):
+def begin(place, name="run", frames=40, **robot):
     """A run on a robot file that the command line names from the folder it is in."""
+    write_robot(place, **robot)
+    folder = place / name
+    robot = ("env.robot_base=robot/ball.xml", "env.sensors_obs=[gyro]")
+    assert status_of(*SMALL, *robot, f"hydra.run.dir={folder}", f"frames={frames}") == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    with contextlib.chdir(place := tmp_path_factory.mktemp("begun")):
+        return begin(place)
+
+
+@pytest.fixture
+def run(begun, tmp_path, monkeypatch):
+    """Makes such a run, or a copy of the one that there is, where the command line then is."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
 
-    def begin(name="run", frames=40, **robot):
-        write_robot(tmp_path, **robot)
-        folder = tmp_path / name
-        robot = ("env.robot_base=robot/ball.xml", "env.sensors_obs=[gyro]")
-        assert status_of(*SMALL, *robot, f"hydra.run.dir={folder}", f"frames={frames}") == 0
-        return folder
+    def run(*name, **keys):
+        if name or keys:
+            return begin(tmp_path, *name, **keys)
+        write_robot(tmp_path)
+        return shutil.copytree(begun, tmp_path / "run")
 
-    return begin
+    return run
 
 
 def test_a_changed_robot_changes_neither_the_run_nor_its_evaluation_nor_its_policy(run, tmp_path):

@@ -123,18 +123,17 @@ def exec_node(trace):
     return {"_target_": "builtins.exec", "_args_": [f"open({str(trace)!r}, 'w')"]}
 
 
-@pytest.mark.parametrize(
-    "key",
-    ["loss", "loss.clip_epsilon", "advantage.gamma", "policy_update.optimizer.lr", "risk",
-     "cost_advantage.lmbda", "lagrangian.init", "critic_update.optimizer", "collector"],
-)  # fmt: skip
-def test_no_key_of_a_run_leaves_a_trace(folder, key):
+def test_no_key_of_a_run_leaves_a_trace(folder):
     path = begun_run(folder / "run")
-    config = OmegaConf.load(path)
-    OmegaConf.update(config, key, exec_node(folder / "trace"), force_add=True)
-    with pytest.raises(ValueError, match=rf"^{key}\._target_=builtins.exec.*import=builtins"):
-        build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
-    assert not (folder / "trace").exists()
+    for key in (
+        *("loss", "loss.clip_epsilon", "advantage.gamma", "policy_update.optimizer.lr", "risk"),
+        *("cost_advantage.lmbda", "lagrangian.init", "critic_update.optimizer", "collector"),
+    ):
+        config = OmegaConf.load(path)
+        OmegaConf.update(config, key, exec_node(folder / "trace"), force_add=True)
+        with pytest.raises(ValueError, match=rf"^{key}\._target_=builtins.exec.*import=builtins"):
+            build_trainer(config, PointMass(config.num_envs, 20), folder / "run")
+        assert not (folder / "trace").exists()
 
 
 def test_a_logger_leaves_no_trace(folder):

@@ -31,8 +31,9 @@ time.sleep(600)
 """
 
 
-@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM])
-@pytest.mark.parametrize(("grace", "last_words"), [(0.0, []), (3.0, ["told"])])
+@pytest.mark.parametrize(
+    ("grace", "ending", "last_words"), [(0.0, signal.SIGKILL, []), (3.0, signal.SIGTERM, ["told"])]
+)
 def test_a_child_ends_soon_after_its_parent(ending, grace, last_words):
     source = PARENT.format(child=CHILD.format(grace=grace))
     parent = subprocess.Popen(

@@ -140,8 +140,7 @@ def test_snippets_run_and_commands_are_taken(page, workplace, tiny_run):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    ["train.py env=PointGaol1", "train.py alog=cpo", "safe-rl evaluate RUN_DIR episode=3"],
+    "wrong", ["train.py env=PointGaol1", "train.py alog=cpo", "safe-rl evaluate RUN_DIR episode=3"]
 )
 def test_a_wrong_command_is_found(wrong, workplace, tiny_run):
     with pytest.raises(ValueError, match=r"Did you mean|no key|no option|Unknown"):

@@ -9,12 +9,7 @@ from torchrl.envs import Compose, TransformedEnv
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
 from safe_rl.envs import make_env
-from safe_rl.envs.transforms import (
-    ActionDelay,
-    ActionFilter,
-    ActionRepeat,
-    EarlyTermination,
-)
+from safe_rl.envs.transforms import ActionDelay, ActionFilter, ActionRepeat, EarlyTermination
 from safe_rl.evaluation.episodes import collect_episodes
 
 

@@ -25,7 +25,7 @@ CONFIGS = {
 }
 # With random actions, goals are often met only in these.
 MEETS_GOALS = ("goal", "push")
-NAMES = [*CONFIGS, *VELOCITY_SUITE]
+NAMES = [*CONFIGS, "SafeHopperVelocity", "SafeAntVelocity"]
 CONFIGS["nested"] = resolve("CarGoal1").replace(**BUSY, observation_flatten=False, layout_seeds=3)
 CONFIGS["one layout"] = resolve("PointPush1").replace(**BUSY, randomize_layout=False)
 COPY = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}

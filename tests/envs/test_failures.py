@@ -32,7 +32,6 @@ def step_with(env, action_of_broken=None, velocity=None) -> TensorDict:
 
 FAULTS = {
     "nan action": {"action_of_broken": math.nan},
-    "infinite velocity": {"velocity": math.inf},
     "nan velocity": {"velocity": math.nan},
     "huge velocity": {"velocity": 1e30},
 }

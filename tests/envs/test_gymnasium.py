@@ -9,16 +9,8 @@ import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
-from torchrl.envs import GymEnv
 
-from safe_rl.envs import (
-    EXTRAS,
-    SUITE,
-    ConfigError,
-    SafetyGymConfig,
-    env_node,
-    make_env,
-)
+from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymConfig, env_node, make_env
 from safe_rl.envs.velocity import VELOCITY_SUITE, resolve_velocity
 
 IDS = [f"Safexp-{name}-v0" for name in (*SUITE, *EXTRAS)]
@@ -34,8 +26,7 @@ def test_every_name_is_registered():
 @pytest.mark.parametrize(
     "env_id",
     [
-        *("Safexp-PointGoal1-v0", "Safexp-CarButton2-v0", "Safexp-DoggoPush1-v0"),
-        *("Safexp-PointRun-v0", "Safexp-Custom-v0"),
+        *("Safexp-PointGoal1-v0", "Safexp-Custom-v0"),
         pytest.param("Safexp-CarPush1Vision-v0", marks=needs_opengl),
     ],
 )
@@ -145,8 +136,10 @@ def run(envs, mode, num_steps):
     return outcomes
 
 
-@pytest.mark.parametrize("flatten", [True, False])
-@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize(
+    ("mode", "flatten"),
+    [*((mode, True) for mode in AutoresetMode), (AutoresetMode.NEXT_STEP, False)],
+)
 def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
     """Rows begin and end apart, because met goals end episodes, and have seeds of their own."""
     config = {"continue_goal": False, "goal_size": 0.9, "num_steps": 30}
@@ -167,16 +160,6 @@ def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
             assert not got[-1][f"_{key.removeprefix('_')}"].any()
     ends = np.array([step[2] | step[3] for step in outcomes if len(step) == 5])
     assert len({tuple(row) for row in ends.T.tolist()}) > 1
-
-
-def test_torchrl_makes_them_by_their_ids_and_reads_their_infos():
-    env = GymEnv("Safexp-PointGoal1-v0", config={"goal_size": 5.0}).auto_register_info_dict()
-    env.set_seed(3)
-    step = env.rollout(5)["next"]
-    assert {"cost", "cost_hazards", "cost_exception"} < set(step.keys())
-    assert step["cost"].dtype == torch.float64
-    assert step["goal_met"].dtype == torch.bool
-    assert step["goal_met"].any()
 
 
 def test_a_batch_that_is_not_reset_says_so():

@@ -20,7 +20,11 @@ POINT = {"robot_base": "point", "task": "none"}
 UNLIKELY = 1e-3  # p values below this one would be a finding
 
 
-@pytest.fixture(params=SUITE, scope="module")
+# every task and level once, with a robot in turn: only its box differs
+STARTS = [name for k, name in enumerate(SUITE) if k // 9 == (k // 3 + k) % 3]
+
+
+@pytest.fixture(params=STARTS, scope="module")
 def start(request):
     """Name, environment and first TensorDict of many fresh layouts, none of which has moved."""
     config = resolve(request.param).replace(**FROZEN)

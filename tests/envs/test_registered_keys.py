@@ -95,10 +95,7 @@ WRONG = {
     "one object": (lambda: register_element(disc("oil", "oil"), {"oil_num": 2}), "only one object"),
     "no place": (lambda: register_task("a", Task(max, goal_at_button=True)), "add 'goal' to"),
     "a built-in key": (lambda: register_element(MINE, {"num_steps": 3}), "'num_steps'.*taken"),
-    "a wrong default": (
-        lambda: register_element(MINE, {"mines_num": "a"}),
-        "mines_num=a",
-    ),
+    "a wrong default": (lambda: register_element(MINE, {"mines_num": "a"}), "mines_num=a"),
 }
 
 

@@ -138,8 +138,9 @@ def is_skin(frame):
 
 
 @needs_opengl
-@pytest.mark.parametrize("name", VELOCITY_SUITE)
-@pytest.mark.parametrize("camera", ["track", "free"])
+@pytest.mark.parametrize(
+    ("name", "camera"), [*((name, "track") for name in VELOCITY_SUITE), ("SafeAntVelocity", "free")]
+)
 def test_cameras_move_with_the_robot(name, camera):
     env = VelocityEnv(name, seed=0, num_threads=1)
     env.reset()

@@ -68,8 +68,7 @@ def test_the_very_centre_of_the_circle_is_no_motion_about_it():
     torch.testing.assert_close(circle_speed(near, velocity, 1.5), torch.tensor([-2 / 2.5]).double())
 
 
-ROBOTS = ("Point", "Car", "Doggo")
-NAMES = [f"{robot}{task}" for robot in ROBOTS for task in ("Run1", "Circle1", "Circle2")]
+NAMES = ("PointRun1", "CarCircle1", "DoggoCircle2")
 
 
 def begin(name, **changes):

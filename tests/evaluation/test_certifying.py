@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,16 +42,23 @@ def make_env(node, *, num_envs, device, seed, num_threads):
     return Bounded(num_envs, 20, seed % 1000)
 
 
-@pytest.fixture
-def train(tmp_path):
-    def train(limits, *overrides):
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    @cache
+    def trained(limits, *overrides):
         config = point_mass_config(f"cost_limits={limits}", "checkpoint.interval=0", *overrides)
         seed_everything(config.seed, None)
         env = PointMass(config.num_envs, 20, config.seed)
-        build_trainer(config, env, tmp_path / "run").run()
-        return tmp_path / "run"
+        build_trainer(config, env, folder := tmp_path_factory.mktemp("trained")).run()
+        return folder
 
-    return train
+    return trained
+
+
+@pytest.fixture
+def train(trained, tmp_path):
+    """Trains a run, or copies the one that was trained so."""
+    return lambda *words: shutil.copytree(trained(*words), tmp_path / "run")
 
 
 def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
@@ -274,7 +282,7 @@ def test_a_device_that_this_machine_lacks_is_replaced(train, monkeypatch):
 
 
 def test_without_limits_there_is_nothing_to_certify(train):
-    directory = train("{}", "algo=ppo")
+    directory = train("{}", "algo=ppo", "frames=160")
     assert certify(directory, OPTIONS, make_env=make_env) is None
 
 

@@ -61,7 +61,7 @@ def test_what_an_evaluation_records_is_what_it_measured(run):
     """Seven episodes of three worlds, which go on together until the last one is done."""
     result = evaluate(run, options(record=True, name="kept"))
     assert [path.name for path in result.files] == [
-        *("evaluation_kept.json", "evaluation_kept.csv", "evaluation_kept.transitions"),
+        *("evaluation_kept.json", "evaluation_kept.csv", "evaluation_kept.transitions")
     ]
     steps = read_recording(result.files[-1])
     assert steps.shape == (3, 3 * NUM_STEPS)

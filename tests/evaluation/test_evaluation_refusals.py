@@ -35,7 +35,6 @@ from safe_rl.evaluation.variations import Variation, varied
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
         (["certify=true", "env.hazards_num=3"], "env: it is ignored by certify=true"),
         (["certificate.episodes=9"], "add certify=true"),
-        (["env.hazards_num=200", "episodes=1"], "hazards"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):

@@ -160,7 +160,6 @@ def tank_of_torchrl():
 gymnasium.register("Tank-v0", entry_point=Tank, max_episode_steps=20)
 PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
 FAMILIES = {
-    "PointGoal1": ({"env.num_steps": 20}, "Safexp-PointGoal1-v0", {"config": {"num_steps": 20}}),
     "SafeHumanoidVelocity": (
         {"env.num_steps": 8}, "SafeHumanoidVelocity-v0", {"config": {"num_steps": 8}}
     ),

@@ -155,15 +155,15 @@ def test_a_file_of_ones_own(run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", SETS)
 def test_keys_of_sets_are_taken_by_training(name):
-    """Every row, as a command line has it; `x1.5` is a number there."""
+    """Every key, as a command line has it; `x1.5` is a number there."""
+    keys = {}
     for variation in read_variations(name):
-        keys = {k: 4 if str(v).startswith("x") else v for k, v in variation.keys.items()}
-        if any(key.endswith("_size") for key in keys):
-            keys = dict.fromkeys(keys, 0.25)
-        transforms = {key.split(".")[1] for key in keys if key.startswith("transforms.")}
-        chosen = [f"transforms=[{','.join(transforms)}]"] if transforms else []
-        changes = [f"{key}={value}" for key, value in keys.items()]
-        composed("env=PointGoal1", *chosen, *changes)
+        is_size = any(key.endswith("_size") for key in variation.keys)
+        number = 0.25 if is_size else 4
+        keys |= {k: number if str(v).startswith("x") else v for k, v in variation.keys.items()}
+    transforms = {key.split(".")[1] for key in keys if key.startswith("transforms.")}
+    chosen = [f"transforms=[{','.join(transforms)}]"] if transforms else []
+    composed("env=PointGoal1", *chosen, *(f"{key}={value}" for key, value in keys.items()))
 
 
 def test_what_concerns_elements_that_are_not_there_is_left_out():

@@ -2,7 +2,7 @@
 
 import json
 
-import gymnasium_envs  # noqa: F401, registers Cliff-v0 and Boxes-v0
+import gymnasium_envs  # noqa: F401, registers Boxes-v0
 import pytest
 import torch
 import yaml
@@ -21,9 +21,7 @@ CART_POLE = ("env.id=CartPole-v1", "env.outside={cost_position: [0, -0.05, 0.05]
 MINIBATCHES = "policy_update.minibatch_size=50"
 
 
-@pytest.mark.parametrize(
-    "algo", [("algo=ppo_lagrangian", MINIBATCHES), ("algo=cpo",), ("algo=trpo_lagrangian",)]
-)
+@pytest.mark.parametrize("algo", [("algo=ppo_lagrangian", MINIBATCHES), ("algo=cpo",)])
 def test_a_cart_learns_to_stay_within_a_range(algo, tmp_path):
     run_train(*SMALL, *CART_POLE, *algo, "frames=600", f"hydra.run.dir={tmp_path}")
     env = yaml.safe_load((tmp_path / "config.yaml").read_text())["env"]
@@ -56,26 +54,3 @@ def test_several_choices_at_once_are_trained_in_processes_too(tmp_path):
     # what every step earns is at most 3, and costs at most 1.5; neither is ever all or nothing
     assert all(0 < value < 30 for value in table["episode_return"])
     assert all(0 < cost < 15 for cost in table["episode_cost"])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("algo", ["ppo", "ppo_lagrangian", "cpo"])
-def test_a_cliff_is_walked_along_or_kept_away_from(algo, tmp_path):
-    """Optimal: a return of 4 at a cost of 5 without a limit, 2.67 at a cost of 3 with it."""
-    cliff = ("env.id=Cliff-v0", "env.flatten=true", "num_envs=20", "frames_per_batch=2000")
-    run_train(
-        *SMALL[:4], "model.hidden_sizes=[8]", *cliff, f"algo={algo}",
-        # with seed 0 PPO-Lagrangian's policy has become certain of the path beside the cliff
-        # before the limit holds, and leaves it no more
-        "cost_limits={cost: 3}", "frames=80_000", "seed=1",
-        *(() if algo == "cpo" else ("policy_update.minibatch_size=500",)),
-        "critic_update.minibatch_size=500", f"hydra.run.dir={tmp_path}",
-    )  # fmt: skip
-    table = read_table(tmp_path / "progress.csv")
-    cost, value = (sum(table[key][-10:]) / 10 for key in ("episode_cost", "episode_return"))
-    if algo == "ppo":
-        assert value > 3.5
-        assert cost > 4.5
-    else:
-        assert value > 1.8
-        assert cost < 3.3

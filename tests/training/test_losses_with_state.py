@@ -79,10 +79,3 @@ def test_losses_of_torchrl_s_keep_no_settings_of_their_value_estimators(kind):
     loss = kind(actor, critic)
     loss.make_value_estimator(gamma=0.9, lmbda=0.8)
     assert not LossState({"loss": loss}, saved_elsewhere=[actor, critic]).tensors
-
-
-@pytest.mark.parametrize("algo", ["cpo", "cup", "ipo", "ppo_lagrangian"])
-def test_checkpoints_of_the_package_s_losses_have_no_part_for_it(tmp_path, algo):
-    minibatch_size = None if algo == "cpo" else 40
-    trainer = point_mass_trainer(tmp_path, f"algo={algo}", minibatch_size=minibatch_size)
-    assert "losses" not in trainer.components

@@ -27,9 +27,6 @@ PPO = ("policy_update.minibatch_size=80", "policy_update.num_passes=2")
 DICTIONARY = ("model=dict", "model.encoders.vector=[4]", "env.observation_flatten=false")
 CHOICES = {
     "dictionary": (*DICTIONARY, *PPO),
-    "tanh": ("model.head=tanh", *PPO),
-    "beta": ("model.head=beta", *PPO),
-    "normalised": ("model.normalise=10", *PPO),
     "memory": ("model=gru", "model.memory.size=4", "model.normalise=10", *PPO),
     "memory_cpo": ("model=gru", "model.memory.size=4", "algo=cpo"),
 }

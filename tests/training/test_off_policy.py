@@ -22,9 +22,7 @@ from safe_rl.trust import allow
 
 pytestmark = pytest.mark.long
 
-NAMES = [
-    *("sac", "sac_lagrangian", "sac_lagrangian_quantile", "td3", "td3_lagrangian", "wcsac", "cal")
-]
+NAMES = ["sac", "sac_lagrangian_quantile", "td3"]  # the others are resumed below
 
 
 @pytest.fixture
@@ -52,7 +50,6 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
 @pytest.mark.parametrize(
     "overrides",
     [
-        ["algo=sac_lagrangian"],
         ["algo=td3_lagrangian", "memory.n_steps=3", "lagrangian=adam"],
         ["algo=sac_lagrangian", "memory.capacity=300", "limits=null"],
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
@@ -308,8 +305,13 @@ class Broken(PointMass):
         return step
 
 
-@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian", "sac", "ppo_lagrangian"])
-@pytest.mark.parametrize("key", ["cost", "reward", "observation"])
+@pytest.mark.parametrize(
+    ("algo", "key"),
+    [
+        *(("sac_lagrangian", key) for key in ("cost", "reward", "observation")),
+        ("ppo_lagrangian", "cost"),
+    ],
+)
 def test_a_wrong_number_is_refused_in_the_batch_in_which_it_arrives(algo, key, tmp_path):
     config = (off_policy_config if algo != "ppo_lagrangian" else compose_config)(
         "env=PointMass", f"algo={algo}", "num_envs=4", "frames_per_batch=160", "logger=none"

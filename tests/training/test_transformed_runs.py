@@ -165,20 +165,17 @@ def command(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["algo=ppo", "transforms=[saute]", "transforms.saute.unsafe_reward=-2"],
-        ["algo=trpo", "transforms=[simmer]", "transforms.simmer.steps=30"],
         pytest.param(
             ["algo=ppo", "transforms=[simmer]", "collector=process", "collector.num_collectors=2"],
             marks=pytest.mark.slow,
         ),
         ["algo=ppo", "transforms=[saute,early_termination]", "cost_limits={cost: 0.5}"],
-        ["algo=trpo", "transforms=[observed_costs,action_repeat]"],
         [
             *("algo=ppo_lagrangian", "transforms=[action_filter]", FILTER),
             *("import=test_transforms_filters.py", "cost_limits={cost_interventions: 3}"),
         ],
     ],
-    ids=["saute", "simmer", "processes", "early_termination", "repeats", "action_filter"],
+    ids=["processes", "early_termination", "action_filter"],
 )
 def test_the_command_line_runs_them(command, arguments):
     status, _, said = command(*RUN, *arguments)
