@@ -26,7 +26,7 @@ def test_the_penalty_of_a_policy_that_has_not_moved():
     with torch.no_grad():
         batch = actor(TensorDict(observation=torch.randn(50, 3), batch_size=[50]))
     batch["advantage"], batch["cost_advantage"] = torch.randn(50, 1), torch.zeros(50, 2)
-    nothing_known = limit_state(torch.nan, torch.nan, length=torch.nan)
+    nothing_known = limit_state(torch.nan, torch.nan)
     assert loss(loss.prepare(batch, nothing_known))["loss_penalty"] == 0
     losses = loss(loss.prepare(batch, limit_state(20.0, -3.0, length=100.0)))
     torch.testing.assert_close(losses["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))

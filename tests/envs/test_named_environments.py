@@ -64,7 +64,7 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
         make_env(node)
     store_config("Slow", node)
     assert make_env(node, num_envs=3).batch_size == (3,)
-    with pytest.raises(ContractError, match=r"made 3 environments instead of num_envs=4"):
+    with pytest.raises(ContractError, match=r"made 3 environments, not num_envs=4"):
         make_env(node, num_envs=4)
     sys.modules["my_family"].make_small = make_few
     with pytest.raises(ContractError, match=r"'device'\. It is called with .* num_envs, device, "):
