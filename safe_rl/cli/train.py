@@ -86,8 +86,6 @@ def prepare(words: Sequence[str]) -> list[str]:
         ['-m', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0']
     """  # noqa: E501
     store_configs(_shown(words))
-    ours = (i for i, word in enumerate(words) if re.match(r"\+*(import|slate)=", word))
-    place = next(ours, 0)
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)
@@ -105,6 +103,8 @@ def prepare(words: Sequence[str]) -> list[str]:
             )
         new.append(f"env={','.join(SLATES[name])}")
     # Hydra's parser of flags takes overrides only where they stand together
+    overrides = (i for i, word in enumerate(words) if re.match("[^-=][^=]*=", word))
+    place = next(overrides, 0)
     return [*words[:place], *new, *words[place:]]
 
 

@@ -15,6 +15,7 @@ RIGHT = [
     ["import=json", "algo=cpo", "--cfg", "job"],
     ["slate=SGPoint", "seed=0", "algo=cpo", "-m"],
     ["-m", "import=json", "seed=0,1", "--config-dir", "conf"],
+    ["import=json", "--config-dir=conf", "env=PointGoal1", "seed=3"],
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
