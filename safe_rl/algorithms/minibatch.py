@@ -248,6 +248,8 @@ class MinibatchUpdate(PolicyUpdate):
     def _diagnostics(history: list[TensorDictBase], num_steps: int) -> dict[str, Tensor]:
         steps = TensorDict.stack(history)
         means: dict[str, Tensor] = steps.float().mean(0).to_dict()
+        # where the update ends, the others being means over its steps: a mean of the predicted
+        # change would be about half of it
         last = {name: steps[name][-1] for name in ("kl", "cost_surrogate") if name in means}
         return means | last | {"num_steps": torch.tensor(num_steps)}
 

@@ -212,9 +212,9 @@ class LimitTracker(Checked, Resumable):
         decay: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
         lowest_realised_share: Lower bound of the share of a predicted change of J_c that is
             expected to occur (column trust_<cost>); 1 expects all of it.
-        integral: Share of every violation that is added to the violations of all later updates (the
-            learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers, which
-            have integrals of their own.
+        integral: Share of every violation that is added to it and to those of all later updates
+            (the learned margin of the code of Ray, Achiam and Amodei 2019); 0 for multipliers,
+            which have integrals of their own.
         largest_integral: Upper bound of the sum that integral adds, as a share of the limit.
 
     Examples:

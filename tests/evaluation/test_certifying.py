@@ -16,12 +16,11 @@ from run_configs import point_mass_config
 
 from safe_rl import envs
 from safe_rl.evaluation import Certificate, CertificateOptions, certify, certifying
-from safe_rl.evaluation.certifying import _RANKING, _TEST, _run, _write
+from safe_rl.evaluation.certifying import _RANKING, _TEST, _run
 from safe_rl.evaluation.episodes import Episodes
 from safe_rl.evaluation.measuring import PolicyEvaluation
 from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import EvaluationOptions
-from safe_rl.reporting.tables import read_certificate
 from safe_rl.runs.run import Run
 from safe_rl.scores.certificate import Claim, Verdict
 from safe_rl.training.building import build_trainer, seed_everything
@@ -384,60 +383,3 @@ def test_what_an_episode_can_cost_is_known_from_the_environment():
     stop = {"_target_": "safe_rl.envs.transforms.EarlyTermination", "budgets": {"cost": 4.0}}
     assert highest(transforms={"stop": stop}, evaluating=True) == 30.0
     assert highest(transforms={"stop": {**stop, "in_evaluation": True}}, evaluating=True) == 5.0
-
-
-@pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
-def test_levels_are_not_rounded(level, shown):
-    certificate = Certificate(None, math.nan, Verdict(None, []), replace(OPTIONS, level=level))
-    assert f"at {shown} with sampled actions: " in str(certificate)
-
-
-def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
-    bounds = {"mean_cost": (10.82, 5.0), "mean_fast": (1.0, 2.0)}
-    verdict = Verdict(None, [0], bounds, {"mean_cost": 5.82}, [], {}, 20)
-    certificate = Certificate(None, math.nan, verdict, OPTIONS)
-    assert str(certificate).endswith("(mean_cost ≤ 10.9, limit 5; 20 new episodes).")
-    # 120 can never suffice
-    assert "at least 561 are needed" in str(replace(certificate, fewest=561))
-    assert "No number of episodes" in str(replace(certificate, fewest=math.inf))
-
-
-CHECKPOINT = Path("checkpoint-000000000100.torchrl")
-
-
-def test_several_bounds_are_a_table_and_what_holds_by_construction_is_said():
-    bounds = {"mean_cost": (24.1, 25.0), "mean_fast": (2.0, 2.0)}
-    verdict = Verdict(0, [0], bounds, {}, ["mean_fast"], {"cost": 1000.0, "fast": 2.0}, 700)
-    means = {"mean_cost": 20.0, "mean_fast": 1.5}
-    head, *rows, last = str(Certificate(CHECKPOINT, 3.0, verdict, OPTIONS, means, 100)).split("\n")
-    assert head.startswith("Certified at 95% with sampled actions, all bounds together (700 new")
-    assert rows == [
-        "  mean_cost ≤ 24.1, limit 25, mean 20",
-        "  mean_fast ≤ 2 by construction, limit 2, mean 1.5",
-    ]
-    assert last.startswith("The bound includes rare")
-    alone = replace(verdict, bounds={"mean_fast": (2.0, 2.0)})
-    said = str(Certificate(CHECKPOINT, 3.0, alone, OPTIONS, {"mean_fast": 1.5}, 100))
-    assert said.startswith("Limit kept with sampled actions: mean_fast ≤ 2 by construction, ")
-    assert "ertified" not in said
-
-
-def test_costs_without_a_highest_are_said_to_count_up_to_a_cap_and_written_as_json(tmp_path):
-    bounds = {"beyond_250_cost": (0.008, 0.01), "mean_cost": (math.inf, 25.0)}
-    verdict = Verdict(0, [0], bounds, {}, [], {"cost": math.inf}, 700)
-    certificate = Certificate(CHECKPOINT, 1.0, verdict, OPTIONS)
-    student = replace(certificate, options=replace(OPTIONS, bound="student"))
-    for one in (certificate, student):
-        assert "The mean of cost is that of costs up to 250; beyond_250_cost is the share" in str(
-            one
-        )
-    assert "assumes that no rare episodes cost far more" in str(student)
-
-    def refuse(constant):
-        raise AssertionError(f"{constant} is no JSON")
-
-    _write(Run(tmp_path), replace(certificate, checkpoint=None), [100])
-    content = json.loads((tmp_path / "certificate.json").read_text(), parse_constant=refuse)
-    assert content["bounds"]["mean_cost"] == {"bound": None, "most": 25.0}
-    assert (content["episodes"], content["most_episodes"]) == (700, 120)
-    assert read_certificate(content)["most_mean_cost"] == 25.0

@@ -201,7 +201,7 @@ class ActionRepeat(ConstraintTransform):
             # A stateless environment reads its state from the last step.
             state = tensordict.clone(False).update(result)
             if not getattr(env, "steps_after_end", False):
-                # so rows that have ended begin an episode whose steps are not counted
+                # it may refuse such steps: rows that have ended begin episodes that do not count
                 state = env.maybe_reset(state)
             after = env._step(state.set("action", tensordict.get("action")))
             after.update({key: result.get(key) + after.get(key) for key in rewards_and_costs})
