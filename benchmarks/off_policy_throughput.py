@@ -27,7 +27,7 @@ from torchrl.data import Bounded
 
 from safe_rl.algorithms import Memory, ReplayUpdate, fast_products
 from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss
+from safe_rl.objectives import LagrangeMultiplier, LimitState, SACLagrangianLoss
 
 ACTIONS = 2
 
@@ -87,7 +87,9 @@ def ours(args: argparse.Namespace) -> Callable[[], None]:
         capacity=20_000, batch_size=args.batch_size, in_keys=loss.in_keys,
         reward_keys=["reward", "cost"], reward_gamma=0.99, n_steps=1, keep=False,
     )  # fmt: skip
-    memory.extend(random_steps(50, 400, args.observation_size))
+    steps = random_steps(50, 400, args.observation_size)
+    memory.extend(steps)
+    loss.prepare(steps, LimitState.of(cost=[30.0], limit=[25.0], length=1000.0))
     update = ReplayUpdate(
         loss,
         optimizer=functools.partial(torch.optim.Adam, lr=1e-3, fused=True),

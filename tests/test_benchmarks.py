@@ -1,4 +1,4 @@
-"""The scripts of `benchmarks/` and `examples/` still find what they import."""
+"""The scripts of `benchmarks/` and `examples/` still find what they import, and measure."""
 
 import runpy
 import subprocess
@@ -19,6 +19,24 @@ def test_scripts_say_what_they_take(script, monkeypatch, capsys):
     with pytest.raises(SystemExit, match="0"):
         runpy.run_path(str(script), run_name="__main__")
     assert script.name in capsys.readouterr().out
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "words",
+    [
+        "velocity_throughput --envs SafeHopperVelocity --num-envs 2 --steps 2 --repeats 1",
+        "train_throughput --epochs 1 num_envs=2 frames_per_batch=40 env.num_steps=20",
+        "off_policy_throughput --updates 2 --repeats 1",
+    ],
+)
+def test_scripts_measure(words, monkeypatch, capsys):
+    name, *arguments = words.split()
+    script = ROOT / "benchmarks" / f"{name}.py"
+    monkeypatch.setattr(sys, "argv", [str(script), *arguments])
+    monkeypatch.syspath_prepend(script.parent)
+    runpy.run_path(str(script), run_name="__main__")
+    assert any(character.isdigit() for character in capsys.readouterr().out)
 
 
 @pytest.mark.long
