@@ -4,8 +4,9 @@ import runpy
 from types import SimpleNamespace
 
 import pytest
-from commands import ROOT, in_a_process
+from commands import ROOT, in_a_process, status_of
 
+from safe_rl.cli.evaluate import main as evaluate
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.table import read_table
 
@@ -26,16 +27,18 @@ def example(registrations_undone):
     return SimpleNamespace(**runpy.run_path(str(PATH)))
 
 
-def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(tmp_path):
+def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(
+    tmp_path, monkeypatch, registrations_undone
+):
     # with workers, which have to import it too
     begun = (*MINES, *SHORT, "collector=process", f"hydra.run.dir={tmp_path}")
     in_a_process("train.py", IMPORT, *begun)
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
-    resume = ("train.py", f"resume={tmp_path}", "frames=160")
-    said = in_a_process(*resume, status=1)
-    assert f"was trained with {IMPORT}: add that to the command" in said
-    in_a_process(*resume, IMPORT)
-    in_a_process("-m", "safe_rl", "evaluate", str(tmp_path), "episodes=2", IMPORT)
+    monkeypatch.chdir(ROOT)
+    resume = (f"resume={tmp_path}", "frames=160")
+    assert f"was trained with {IMPORT}: add that to the command" in str(status_of(*resume))
+    assert status_of(*resume, IMPORT) == 0
+    assert evaluate([str(tmp_path), "episodes=2", IMPORT]) == 0
     assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
     assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
 
