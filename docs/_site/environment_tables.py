@@ -27,16 +27,8 @@ COMPONENTS = {
     "ballquat_.*": ("1", "rotation matrix of a ball joint, 3 × 3", "sensors_ball_joints"),
     "jointvel_.*": ("rad/s", "speed of a hinge", "sensors_hinge_joints"),
     "jointpos_.*": ("1", "sine and cosine of a hinge's angle", "sensors_hinge_joints"),
-    ".*_lidar": (
-        "1",
-        "closeness of the nearest object by direction: 1 at it, 0 if too far",
-        "observe_<kind>, lidar_num_bins",
-    ),
-    ".*_compass": (
-        "1",
-        "direction to the object in the robot's frame, a unit vector",
-        "observe_goal_comp, observe_box_comp",
-    ),
+    ".*_lidar": ("1", "closeness by direction: 1 at an object", "observe_<kind>, lidar_num_bins"),
+    ".*_compass": ("1", "direction in the robot's frame", "observe_goal_comp, observe_box_comp"),
     "goal_dist": ("1", "e to the minus distance to the goal [m]", "observe_goal_dist"),
     "remaining": ("1", "share of the episode's steps taken so far", "observe_remaining"),
     "com": ("m", "the robot's centre of mass, in the frame of the world", "observe_com"),
@@ -89,17 +81,13 @@ def _sizes(env: SafetyGymEnv | VelocityEnv) -> tuple[int, int]:
 
 def velocity() -> str:
     """The family of velocity limits."""
-    rows = [
-        [
-            f"`{name}`",
-            f"{name.removeprefix('Safe').removesuffix('Velocity')}-v5",
-            f"{keys['velocity_threshold']:g}",
-            *_sizes(VelocityEnv(keys, num_envs=1)),
-        ]
-        for name, keys in VELOCITY_SUITE.items()
-    ]
-    sizes = ["size of observation", "size of action"]
-    return table(["`env=`", "Gymnasium's id", "threshold [m/s]", *sizes], rows)
+    rows = []
+    for name, keys in VELOCITY_SUITE.items():
+        id_of_gymnasium = f"{name.removeprefix('Safe').removesuffix('Velocity')}-v5"
+        sizes = _sizes(VelocityEnv(keys, num_envs=1))
+        rows.append([f"`{name}`", id_of_gymnasium, f"{keys['velocity_threshold']:g}", *sizes])
+    head = ["`env=`", "Gymnasium's id", "threshold [m/s]", "size of observation", "size of action"]
+    return table(head, rows)
 
 
 def keys() -> str:
@@ -137,15 +125,11 @@ def observations() -> str:
 
 
 def component_of(name: str) -> str:
-    """The pattern in `COMPONENTS` that explains a component.
-
-    Raises:
-        KeyError: If there is none.
-    """
-    found = [pattern for pattern in COMPONENTS if re.fullmatch(pattern, name)]
-    if not found:
-        raise KeyError(f"docs/_site/environment_tables.py explains no component '{name}'")
-    return found[0]
+    """The pattern in `COMPONENTS` that explains a component; KeyError if there is none."""
+    for pattern in COMPONENTS:
+        if re.fullmatch(pattern, name):
+            return pattern
+    raise KeyError(f"docs/_site/environment_tables.py explains no component '{name}'")
 
 
 def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
@@ -158,8 +142,7 @@ def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
     everything |= {"task": "push", "observation_flatten": True}
     yield "any", SafetyGymEnv(everything | {"robot_base": "point"}, num_envs=1)
     yield "Car", SafetyGymEnv(everything | {"robot_base": "car", "observe_freejoint": True}, 1)
-    seeing = {"robot_base": "point", "task": "goal", "observe_vision": True}
-    yield "any", SafetyGymEnv(seeing, num_envs=1)
+    yield "any", SafetyGymEnv({"robot_base": "point", "task": "goal", "observe_vision": True}, 1)
 
 
 def _alike(names: Sequence[str]) -> list[tuple[str, list[str]]]:
@@ -171,11 +154,6 @@ def _alike(names: Sequence[str]) -> list[tuple[str, list[str]]]:
     return list(groups.items())
 
 
-def lidars() -> str:
-    """Keys that turn lidars on."""
-    return ", ".join(f"`{element.flag or 'observe_' + element.kind}`" for element in ELEMENTS) + "."
-
-
 def costs() -> str:
     """Costs, their keys and their sizes."""
     flags = {row.key: f"`constrain_{row.key.split('_')[1]}`" for row in COSTS}
@@ -184,4 +162,4 @@ def costs() -> str:
     return table(["cost", "it is positive if", "switched on by"], rows)
 
 
-TABLES = (benchmark, debug, velocity, keys, observations, lidars, costs)
+TABLES = (benchmark, debug, velocity, keys, observations, costs)

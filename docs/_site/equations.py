@@ -14,11 +14,7 @@ _COMMAND = re.compile(r"\\[a-zA-Z]+")
 
 
 def typeset(page: str) -> str:
-    """Replace the equations of a page, as Arithmatex marks them.
-
-    Raises:
-        ValueError: For an equation with a command that is not known.
-    """
+    """Replace the equations of a page; ValueError for a command that is not known."""
     return _EQUATION.sub(_mathml, page)
 
 

@@ -23,13 +23,7 @@ _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?!\w+:|#|/)(?P<path>[^)\s#]+)(?P<res
 
 
 def rewrite(text: str, page: str, root: Path) -> str:
-    """The Markdown of a page as the site shows it.
-
-    Args:
-        text: The Markdown.
-        page: The page, relative to ``docs/``.
-        root: Folder of the repository.
-    """
+    """The Markdown of a page, which is relative to ``docs/``, as the site shows it."""
     source = PurePosixPath(PAGES.get(page, f"docs/{page}"))
     page_of = {source: name for name, source in PAGES.items()}
 

@@ -49,22 +49,12 @@ def columns(names: str) -> str:
     return "\n".join([head, "|---|---|", *rows])
 
 
-TABLES: dict[str, Callable[..., str]] = {
-    table.__name__: table
-    for table in (
-        *(conf, listed, columns),
-        *environment_tables.TABLES,
-        *result_tables.TABLES,
-    )
-}
+_ALL = (conf, listed, columns, *environment_tables.TABLES, *result_tables.TABLES)
+TABLES: dict[str, Callable[..., str]] = {table.__name__: table for table in _ALL}
 
 
 def fill(page: str) -> str:
-    """The text of a page with the tables that it asks for.
-
-    Raises:
-        KeyError: If there is no such table.
-    """
+    """The text of a page with the tables that it asks for; KeyError if there is no such table."""
 
     def made(match: re.Match[str]) -> str:
         return f"{match[1]}\n{TABLES[match[2]](*filter(None, [match[3]]))}\n\n{match[4]}"

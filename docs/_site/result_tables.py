@@ -1,7 +1,4 @@
-"""Tables of results for the pages, made from the archived runs in ``results/``.
-
-A page has marks where a table goes, see ``marks.py``.
-"""
+"""Tables of results for the pages, made from the archived runs in ``results/``."""
 
 from __future__ import annotations
 
@@ -32,8 +29,7 @@ HEADS = {
     "new": "new episodes", "bound": "certified", "omnisafe": "OmniSafe, 10M steps",
     "paper": "Ray et al. (2019), 10M steps",
 }  # fmt: skip
-# The columns "PPOLag" of Table 2 of OmniSafe's benchmarks/on-policy/README.md, commit 15603dd:
-# episode cost and return, each with its deviation.
+# "PPOLag" in Table 2 of OmniSafe's benchmarks/on-policy/README.md, commit 15603dd: cost / return
 OMNISAFE = {
     "SafeAntVelocity": "12.1 ± 6.6 / 3262 ± 80",
     "SafeHalfCheetahVelocity": "3.4 ± 4.8 / 2946 ± 306",
@@ -44,6 +40,7 @@ OMNISAFE = {
 }
 # campaigns with the default settings and three million steps
 _THREE_MILLION = ("reference", "held_out", "eighteen")
+_CELL = ("environment", "algorithm")  # of a table: the runs that differ in seeds only
 Rows = list[dict[str, Any]]
 
 
@@ -62,17 +59,10 @@ def runs(campaign: str) -> pandas.DataFrame:
 
 
 def figures(run: Any, last: float, start: float = 0) -> dict[str, float]:
-    """Figures of a run.
+    """Figures of a run: return and cost of an episode over its last steps, costs after `start`.
 
-    Args:
-        run: An archived run.
-        last: Number of steps at its end over which return and cost are averaged.
-        start: Step from which on costs are compared with the limit.
-
-    Returns:
-        ``return`` and ``cost`` of an episode, ``since`` (cost from `start` on), ``above`` (share of
-        the spans of 20,000 steps from `start` on whose mean cost is above the limit), ``rate``
-        (cost of a step of the whole run).
+    ``since`` is the cost from `start` on, ``above`` the share of spans of 20,000 steps from there
+    on whose mean cost is above the limit, ``rate`` the cost of a step of the whole run.
     """
     epochs = pandas.DataFrame(run.table)
     late = epochs[epochs.steps > epochs.steps.iloc[-1] - last]
@@ -113,9 +103,7 @@ def summary(
     }
 
 
-def summaries(
-    campaign: str, *given: float, by: Iterable[str] = ("environment", "algorithm")
-) -> Rows:
+def summaries(campaign: str, *given: float, by: Iterable[str] = _CELL) -> Rows:
     """A row for every group of runs of a campaign."""
     return [summary(group, *given) for _, group in runs(campaign).groupby([*by], sort=False)]
 
@@ -148,25 +136,17 @@ def markdown(heads: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
 
 def table(rows: Iterable[Mapping[str, Any]], *columns: str) -> str:
     """A table of some columns of rows."""
-    return markdown(
-        (HEADS.get(name, name) for name in columns), ([row[key] for key in columns] for row in rows)
-    )
+    cells = ([row[key] for key in columns] for row in rows)
+    return markdown((HEADS.get(name, name) for name in columns), cells)
 
 
-def held_out() -> str:
-    """Constrained algorithms on held-out seeds after three million steps."""
-    return table(summaries("held_out", MILLION / 2, MILLION), *_LONG)
-
-
-def further() -> str:
-    """The paper's algorithms on seven further environments, as far as the campaign is."""
-    rows = summaries("eighteen", MILLION / 2, MILLION)
-    return table(rows, *_LONG) if rows else "No archived runs yet."
+def three_million(campaign: str) -> str:
+    """Runs of a campaign on held-out seeds after three million steps."""
+    return table(summaries(campaign, MILLION / 2, MILLION), *_LONG)
 
 
 _SHORT = ("cost", "return", "above", "rate", "certified", "seeds")
-_LONG = ("environment", "algorithm", "cost", "return", "rate", "certified", "since", "above")
-_LONG += ("new", "seeds")
+_LONG = (*_CELL, "cost", "return", "rate", "certified", "since", "above", "new", "seeds")
 
 
 def compared(env: str) -> str:
@@ -195,9 +175,8 @@ def single(campaign: str) -> str:
         row = summary(found.to_frame().T, MILLION / 2) | {"seed": found.seed}
         row |= {n: "" if np.isnan(c) else f"{c:.0f} / {r:.1f}" for n, c, r in means.itertuples()}
         told = found.run.notes.get("certificate") or {}
-        row["bound"] = (
-            f"no, by {told['shortfalls']['mean_cost']:.1f}" if told.get("shortfalls") else "—"
-        )
+        missed = told.get("shortfalls")
+        row["bound"] = f"no, by {missed['mean_cost']:.1f}" if missed else "—"
         if told.get("certified"):
             bound = told["bounds"]["mean_cost"]["bound"]
             claim = f"≤ {rounded_up(bound):.1f}"
@@ -205,8 +184,7 @@ def single(campaign: str) -> str:
                 claim = "by construction,"
             row["bound"] = f"{claim} at {told['episode_return']:.1f}"
         rows.append(row)
-    named = ("one_transform", "push", "doggo", "privileged_trials")
-    settings = ["name"] if campaign in named else []
+    settings = ["name"] if len({row["name"] for row in rows}) > 1 else []
     # of trials that were stopped, ends cannot be compared
     ends = () if campaign == "privileged_trials" else ("cost", "return", "rate", "bound")
     names = [name for name in names if any(row[name] for row in rows)]
@@ -271,11 +249,8 @@ def coverage() -> str:
     """What each environment of the benchmark has: seeds × million steps of finished runs."""
     own = ("algorithms", "doggo", *_THREE_MILLION)
     found = pandas.concat([runs(name).query("name == ''").assign(what="own") for name in own])
-    others = {
-        "held_actions": "`preset=hard_tasks`",
-        "privileged": "`preset=privileged`",
-        "paper_preset": "paper's settings",
-    }
+    others = {"held_actions": "`preset=hard_tasks`", "privileged": "`preset=privileged`"}
+    others |= {"paper_preset": "paper's settings"}
     found = pandas.concat([found, *(runs(name).assign(what=what) for name, what in others.items())])
     found = found[[run.is_finished for run in found.run]]
     shown = [*ALGORITHMS, "sac_lagrangian", "td3_lagrangian"]
@@ -317,5 +292,5 @@ def readme() -> str:
     )
 
 
-TABLES = (held_out, further, rivals, paper_preset, coverage, compared, measured, single, parts)
+TABLES = (three_million, rivals, paper_preset, coverage, compared, measured, single, parts)
 TABLES += (velocity_runs, paper_tables, readme)
