@@ -25,7 +25,7 @@ from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import Estimate
 
 _FACTOR = "x"
-_SETS = CONF / "variations.yaml"
+_SETS = Path(__file__).with_suffix(".yaml")
 
 
 class Variation(NamedTuple):
@@ -52,7 +52,7 @@ def read_variations(given: Any) -> list[Variation]:
     """Variations that ``variations=…`` asks for, one for each value of a row's list.
 
     Args:
-        given: Name of a set in ``conf/variations.yaml`` (variations that the environment cannot
+        given: Name of a set in ``variations.yaml`` (variations that the environment cannot
             have are left out), path of a YAML file with rows, a mapping from row to keys, or a list
             of these.
 
@@ -78,7 +78,7 @@ def read_variations(given: Any) -> list[Variation]:
             except (OSError, ValueError) as error:
                 raise ValueError(f"variations={part}: {error}") from error
         if not isinstance(rows, Mapping) or not rows:
-            raise ValueError(f"variations={part}: it must have rows, as conf/variations.yaml has.")
+            raise ValueError(f"variations={part}: it must have rows, as {_SETS} has.")
         variations += [
             v._replace(may_lack=is_set) for name in rows for v in _expand(str(name), rows[name])
         ]

@@ -59,9 +59,9 @@ def test_tables_on_pages_are_what_the_program_and_the_archive_give(page):
 
 
 def test_a_mark_gets_its_table_and_only_that():
-    filled = marks.fill("a\n<!-- made: lidars -->\nold\n<!-- end -->\nb")
-    assert filled.startswith("a\n<!-- made: lidars -->\n\n`observe_")
-    assert filled.endswith(".\n\n<!-- end -->\nb")
+    filled = marks.fill("a\n<!-- made: conf risk/cvar.yaml -->\nold\n<!-- end -->\nb")
+    assert filled.startswith("a\n<!-- made: conf risk/cvar.yaml -->\n\n`conf/risk/cvar.yaml`:")
+    assert filled.endswith("```\n\n<!-- end -->\nb")
     assert "old" not in filled
 
 

@@ -15,14 +15,14 @@ from PIL import Image
 import safe_rl
 from safe_rl.cli.evaluate import main
 from safe_rl.evaluation import EvaluationOptions, evaluate
-from safe_rl.evaluation.variations import Variation, read_variations, varied
+from safe_rl.evaluation.variations import _SETS, Variation, read_variations, varied
 from safe_rl.files import CONF, read_yaml
 
 pytestmark = pytest.mark.long
 
 SMALL = {"num_envs": 4, "frames_per_batch": 160, "frames": 160, "logger": "none", "num_threads": 1}
 QUICK = ("episodes=6", "num_envs=3", "num_threads=1")
-SETS = sorted(read_yaml(CONF / "variations.yaml"))
+SETS = sorted(read_yaml(_SETS))
 
 
 @pytest.fixture(scope="module")
