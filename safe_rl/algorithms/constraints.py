@@ -172,7 +172,7 @@ class Constraints(Resumable):
         ends = batch["next", "done"].squeeze(-1).cpu()
         before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
         finished = episodes.episode_costs(self.keys).cpu()
-        self._penalised = self.risk(costs, ends, before.nan_to_num(0.0).to(costs), finished)
+        self._penalised = self.risk(costs, ends, before.to(costs), finished)
         device = batch.device or self.limits.device
         batch["next", PENALISED_COSTS] = self._penalised.costs.to(device)
 

@@ -79,7 +79,7 @@ class EpisodeStatistics:
         cost_rates: Cost key -> all cost so far divided by all steps so far, ρ_c, scalar tensors.
         reward_rate: All reward so far divided by all steps so far, a scalar tensor.
         open_costs: Cost key -> cost that the unfinished episode of every row had before the batch,
-            shape [N]; NaN for episodes that are left out of the statistics.
+            shape [N].
 
     Examples:
         >>> import torch
@@ -200,11 +200,12 @@ class EpisodeAccounting(Resumable):
         """Restore the sums.
 
         Raises:
-            ValueError: If numbers of steps or costs are below 0, or sums are not finite. Only those
-                of an episode that is left out are NaN, all of them.
+            ValueError: If numbers of steps or costs are below 0, or sums are not finite. Only the
+                number of steps of an episode that is left out is NaN.
         """
         super().load_state_dict(state_dict)
-        sums = torch.cat([self.open_sums[~self.open_sums.isnan().all(1)], self.totals[None]])
+        sums = torch.cat([self.open_sums, self.totals[None]])
+        sums[:-1, 0].masked_fill_(sums[:-1, 0].isnan(), 0.0)
         # the second column has rewards
         if not sums.isfinite().all() or (sums[:, [0, *range(2, sums.shape[1])]] < 0).any():
             raise ValueError("sums of steps and costs must be finite and not below 0.")
@@ -292,4 +293,5 @@ class EpisodeAccounting(Resumable):
 
     def ignore_open_episodes(self) -> None:
         """Leave the present episodes, whose first steps are missing, out of all statistics."""
-        self.open_sums.fill_(torch.nan)
+        # costs are known: risk measures charge every step of these episodes, too
+        self.open_sums.zero_()[:, 0] = torch.nan

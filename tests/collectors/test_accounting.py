@@ -124,6 +124,8 @@ def test_episodes_that_are_open_can_be_left_out_of_the_statistics_of_episodes():
         assert everything.cost_rates == rest.cost_rates
         expected = [] if not everything.num_episodes else everything.returns.tolist()
         assert set(rest.returns.tolist()) <= set(expected)
+        # what risk measures charge: of all episodes
+        torch.testing.assert_close(everything.open_costs, rest.open_costs, rtol=0, atol=0)
         if partial.open_sums.isfinite().all():
             break
     assert partial.open_sums.isfinite().all()
