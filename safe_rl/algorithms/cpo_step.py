@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 import scipy  # its parts are loaded on first use, which takes half a second
 import torch
 from pydantic import PositiveFloat
@@ -138,14 +139,15 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     """Multipliers of the projection onto half-spaces bᵢᵀx + cᵢ ≤ 0, in the metric L.
 
     The nearest point to x₀ is x₀ − Σᵢ νᵢ L⁻¹bᵢ, where ν ≥ 0 minimises ½ νᵀSν − νᵀe with
-    e = b x₀ + c and Sᵢⱼ = bᵢᵀL⁻¹bⱼ. For one half-space, ν = max(0, e/s).
+    e = b x₀ + c and Sᵢⱼ = bᵢᵀL⁻¹bⱼ. For one half-space, ν = max(0, e/s). It is solved as a problem
+    of least distance (Lawson and Hanson 1974, section 23.4), also if the bᵢ depend on each other.
 
     Args:
         excess: e, [k].
         gram: S, [k, k]; positive semi-definite. Constraints without a gradient are left out.
 
     Returns:
-        ν, [k].
+        ν, [k]; 0 if no point is in all half-spaces.
 
     Examples:
         >>> nearest_feasible(torch.tensor([2.0, -1.0]), torch.tensor([[4.0, 0.0], [0.0, 1.0]]))
@@ -154,12 +156,14 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     lengths = gram.double().diagonal().clamp_min(0).sqrt()
     scale = torch.where(lengths > 1e-8, 1 / lengths, 0.0)
     values, vectors = torch.linalg.eigh(gram.double() * scale[:, None] * scale)
-    roots = values.clamp_min(0).sqrt()
-    inverse = torch.where(roots > 1e-6, 1 / roots, 0.0)
-    factor = roots[:, None] * vectors.T
-    target = inverse * (vectors.T @ (scale * excess.double()))
-    solution, _ = scipy.optimize.nnls(factor.cpu().numpy(), target.cpu().numpy())
-    return (torch.from_numpy(solution).to(scale) * scale).to(excess)
+    beyond = scale * excess.double()
+    unit = beyond.abs().max().clamp_min(1e-300)
+    rows = torch.cat([values.clamp_min(0).sqrt()[:, None] * vectors.T, beyond[None] / unit])
+    last = np.eye(len(rows))[-1]
+    solution = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), last)[0]).to(scale)
+    left = 1 - rows[-1] @ solution
+    nu = torch.where(left > 1e-9, solution * unit / left, 0.0)
+    return (nu * scale).to(excess)
 
 
 class PCPOStep(CPOStep):

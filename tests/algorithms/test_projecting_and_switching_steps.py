@@ -50,9 +50,17 @@ def test_the_nearest_feasible_point_is_that_of_a_solver(num_costs):
         np.testing.assert_allclose(start - nu @ back, solved.x, atol=1e-4)
 
 
-def test_constraints_without_a_gradient_are_left_out():
-    nu = nearest_feasible(torch.tensor([1.0, 3.0]), torch.tensor([[2.0, 0.0], [0.0, 0.0]]))
-    assert nu.tolist() == pytest.approx([0.5, 0.0])
+@pytest.mark.parametrize(
+    ("excess", "gram", "nu"),
+    [
+        ([1.0, 3.0], [[2.0, 0.0], [0.0, 0.0]], [0.5, 0.0]),  # one without a gradient is left out
+        ([2.0, -4.0], [[1.0, 1.0], [1.0, 1.0]], [2.0, 0.0]),  # two limits of the same cost
+        ([1.0, 1.0], [[1.0, -1.0], [-1.0, 1.0]], [0.0, 0.0]),  # they contradict each other
+    ],
+)
+def test_constraints_may_depend_on_each_other(excess, gram, nu):
+    found = nearest_feasible(torch.tensor(excess), torch.tensor(gram))
+    assert found.tolist() == pytest.approx(nu)
 
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])
