@@ -34,8 +34,8 @@ def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
         tensor([0.0000, 1.5343,    inf])
     """
     a, s = change.double(), slack.double()
-    left = (s - a).clamp_min(0)
-    inside = a + torch.xlogy(left, left / s)
+    # the logarithm of (s - a)/s would lose a small a beside a large s
+    inside = a + torch.special.xlog1py((s - a).clamp_min(0), -a / s)
     return torch.where(a > s, torch.inf, inside).to(change)
 
 

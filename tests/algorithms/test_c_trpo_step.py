@@ -50,6 +50,10 @@ def test_the_divergence_is_that_of_its_definition(slack):
     assert barrier_divergence(torch.tensor(1.01 * slack), torch.tensor(slack)) == torch.inf
 
 
+def test_a_limit_far_away_is_no_barrier():
+    assert barrier_divergence(torch.tensor(5.0), torch.tensor(1e18)) == pytest.approx(0, abs=1e-9)
+
+
 def test_the_step_is_the_natural_one_of_the_divergence():
     """Its Hessian by differentiating twice what it is the Hessian of."""
     actor, batch = make_case()
