@@ -66,10 +66,8 @@ class CPOStep(TRPOStep):
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        self.rescale_violation, self.largest_required_decrease = (
-            rescale_violation,
-            largest_required_decrease,
-        )
+        self.rescale_violation = rescale_violation
+        self.largest_required_decrease = largest_required_decrease
 
     def _propose(self, problem: StepProblem) -> Proposal:
         g, b, c = self._linearised(problem)

@@ -77,12 +77,8 @@ def _other_environment(config: DictConfig) -> str:
         name = read_config(Path(config.dataset.path).parent / "config.yaml")["env"]["name"]
     except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
         return ""
-    name_here = config.env.name
-    return (
-        ""
-        if name == name_here
-        else f" Warning: they are of {name}, and this environment is {name_here}."
-    )
+    here = config.env.name
+    return "" if name == here else f" Warning: they are of {name}, and this environment is {here}."
 
 
 def _fill(
@@ -168,10 +164,8 @@ def _as_chosen(
     Raises:
         ValueError: If actions of a file, or of another environment, are outside the bounds.
     """
-    chosen, raw = (
-        [spec.low.cpu(), spec.high.cpu()],
-        [bound.flatten() for bound in env.action_bounds],
-    )
+    chosen = [spec.low.cpu(), spec.high.cpu()]
+    raw = [bound.flatten() for bound in env.action_bounds]
     if is_recorded:
         recorded = _recorded_bounds(interface, chosen + raw)
         action = action.clamp(*recorded[:2])
