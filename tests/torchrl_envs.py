@@ -55,6 +55,26 @@ class Charged(Runner):
         return super()._reset(tensordict).exclude("cost_effort")
 
 
+class Ends(EnvBase):
+    """One that ends after two steps, and says `done` alone."""
+
+    def __init__(self):
+        super().__init__()
+        self.observation_spec = Composite(place=Unbounded(1), cost_effort=Unbounded(1))
+        self.action_spec, self.reward_spec = Bounded(0.0, 1.0, (1,)), Unbounded(1)
+
+    def _reset(self, tensordict=None, **_):
+        self._place = torch.zeros(1)
+        return TensorDict(place=self._place, cost_effort=torch.zeros(1))
+
+    def _step(self, tensordict):
+        self._place = self._place + 1
+        step = {"place": self._place, "cost_effort": torch.ones(1)}
+        return TensorDict(step).update({"reward": torch.ones(1), "done": self._place >= 2})
+
+    def _set_seed(self, seed): ...
+
+
 class Alone(PendulumEnv):
     """A pendulum that cannot be reset with others."""
 

@@ -163,11 +163,18 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**PENDULUM, **keys})
 
 
+def test_an_end_without_a_reason_is_a_termination(trusted):
+    env = make_env(RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5}, num_envs=2, seed=0)
+    assert env.rollout(5)["next", "terminated"].flatten().tolist() == [False, True] * 2
+
+
 def test_only_what_was_imported_is_reached(trusted):
     with pytest.raises(ConfigError, match="one number per row"):
         make_env(PENDULUM | {"cost": "torchrl_envs:wrong"}, num_envs=2)
     with pytest.raises(ConfigError, match="called cost_<kind>, not 'th'"):  # it would replace th
         make_env(PENDULUM | {"cost": {"_target_": "torchrl_envs.wrong", "th": 1}}, num_envs=2)
+    with pytest.raises(ConfigError, match="two costs called 'cost_effort': rename one"):
+        make_env(RUNNER | {"cost": {"_target_": "torchrl_envs.wrong", "cost_effort": 1}})
     with pytest.raises(TargetError, match=r"env\.cost=os\.getcwd.*import=os"):
         make_env(PENDULUM | {"cost": "os:getcwd"})
     with pytest.raises(TargetError, match=r"env\.id=torchrl\.envs.*import=torchrl\.envs"):

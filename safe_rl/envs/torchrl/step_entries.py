@@ -90,7 +90,9 @@ class StepCosts(Transform):
         costs: dict[str, Tensor] = {}
         for name, cost in named_costs:
             if name in costs:
-                raise ConfigError(f"There are two costs called '{name}'.")
+                raise ConfigError(
+                    f"There are two costs called '{name}': rename one, or choose env.cost_keys=[…]."
+                )
             if not isinstance(cost, Tensor) or cost.numel() != step.batch_size.numel():
                 shown = list(cost.shape) if isinstance(cost, Tensor) else type(cost).__name__
                 raise ConfigError(f"The cost '{name}' must be one number per row, got {shown}.")
@@ -100,6 +102,10 @@ class StepCosts(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         costs = self._costs(tensordict.clone(False).set("next", next_tensordict))
+        done = next_tensordict["done"]
+        ended = done & ~next_tensordict.get("truncated", torch.zeros_like(done))
+        # `SerialEnv` leaves it false where an environment writes `done` alone
+        costs["terminated"] = next_tensordict["terminated"] | ended
         return next_tensordict.exclude(*self._entries.values()).update(costs)
 
     def _reset(
@@ -121,6 +127,7 @@ class StepCosts(Transform):
             highest[COST] = float(len(highest))
         for name in self.names:
             like: dict[str, Any] = {"shape": (*rewards.shape, 1), "device": rewards.device}
+            like["dtype"] = torch.float32  # not torch's default
             most = highest.get(name)
             rewards[name] = Unbounded(**like) if most is None else Bounded(0.0, most, **like)
         return output_spec
@@ -210,20 +217,19 @@ class Observe(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add `observation`, and remove the entries that are moved there."""
         shape, device = observation_spec.shape, observation_spec.device
+        vector = partial(Unbounded, device=device, dtype=torch.float32)
         parts = {
-            self._names[name]: spec
-            if _is_picture(spec)
-            else Unbounded((*shape, _size(spec)), device=device)
+            self._names[name]: spec if _is_picture(spec) else vector((*shape, _size(spec)))
             for name, spec in self._specs.items()
         }
         for key in self._moved:
             if key in observation_spec.keys(True):
                 del observation_spec[key]
         for spec in self._privileged.values():
-            observation_spec[_PRIVILEGED] = Unbounded((*shape, _size(spec)), device=device)
+            observation_spec[_PRIVILEGED] = vector((*shape, _size(spec)))
         if self._flatten:
             size = sum(map(_size, self._specs.values()))
-            observation_spec[_OBSERVATION] = Unbounded((*shape, size), device=device)
+            observation_spec[_OBSERVATION] = vector((*shape, size))
         elif len(parts) == 1:
             observation_spec[_OBSERVATION] = next(iter(parts.values()))
         else:
