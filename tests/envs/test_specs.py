@@ -2,12 +2,14 @@
 
 import itertools
 
+import gymnasium
 import pytest
 import torch
 from torchrl.envs import ConditionalSkip, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import SUITE, SafetyGymEnv, env_node, make_env, resolve
+from safe_rl.envs import SUITE, SafetyGymEnv, env_node, from_gymnasium, make_env, resolve
+from safe_rl.envs.transforms import ObservedCosts
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
 # By hand from sections 4, 8 and 9 of the benchmark's description: names and sizes.
@@ -130,6 +132,19 @@ def test_specs_of_the_velocity_family(name):
     assert list(env.full_reward_spec.keys()) == ["reward", *env.cost_keys]
     columns = [i for span in env.observation_layout.values() for i in range(span.start, span.stop)]
     assert columns == list(range(env.observation_spec["observation"].shape[-1]))
+
+
+@pytest.mark.parametrize("env_name", ["PointGoal1", "SafeHopperVelocity", "Pendulum-v1"])
+def test_specs_hold_with_another_default_dtype(env_name):
+    torch.set_default_dtype(torch.float64)
+    try:
+        if env_name in gymnasium.registry:
+            env = from_gymnasium(env_name, num_envs=2, outside={"cost_speed": [2, -1, 1]})
+        else:
+            env = make_env(env_name, num_envs=2, transforms={"costs": ObservedCosts(0.9)})
+        check_env_specs(env)
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.parametrize("env_name", ["PointGoal1", "SafeSwimmerVelocity"])

@@ -238,7 +238,7 @@ class ObservedCosts(ConstraintTransform):
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return zeros."""
         shape = (*done.shape[:-1], len(self._observed()))
-        return {name: torch.zeros(shape, device=done.device) for name in (LAST, TRACE)}
+        return {name: done.new_zeros(shape, dtype=torch.float32) for name in (LAST, TRACE)}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         costs = costs_of(next_tensordict, self._observed()).float()

@@ -91,10 +91,11 @@ class VelocityEnv(SimulatedEnv):
         place = PLACES[RUNNERS[self.config.robot].place]
         self._place = place.reading(self._model, self._physics)
         self._last_place = self._place()
-        self._observation = torch.zeros(num_envs, self._observer.size, device=physics.device)
+        shape = (num_envs, self._observer.size)
+        self._observation = torch.zeros(shape, dtype=torch.float32, device=physics.device)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64, device=physics.device)
         self._starts = Starts(self.config, self._model)
-        observed = Unbounded(self._observation.shape, dtype=torch.float32, device=self.device)
+        observed = Unbounded(shape, dtype=torch.float32, device=self.device)
         self._draw_dynamics(self._model, slice(1, self._model.nbody))
         self._announce(self._model, observed, highest=1.0, seed=seed)
 
