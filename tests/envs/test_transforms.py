@@ -205,6 +205,8 @@ def test_nodes_are_built_and_their_keys_named():
     loss["cost_limits"] = {"cost": 25.0}
     with pytest.raises(TargetError, match="no Transform"):
         make_env({"robot_base": "point"}, transforms={"slow": loss})
+    with pytest.raises(TargetError, match=r"^transforms\.n: .* Use model\.normalise=10"):
+        make_env("PointGoal1", transforms={"n": {"_target_": "transforming.normed"}})
     with pytest.raises(ConfigError, match=r"'transforms' must map names .* got \['saute'\]"):
         make_env({"robot_base": "point"}, transforms=["saute"])
 

@@ -3,6 +3,7 @@
 import gymnasium_envs  # noqa: F401, registers Walk-v0
 import torch
 from point_mass import PointMass
+from torchrl.envs.transforms import VecNormV2
 
 from safe_rl.envs import SafetyGymEnv, from_gymnasium
 from safe_rl.envs.transforms import (
@@ -67,3 +68,8 @@ def still(env, steps, action=0.0):
     """Rollout with one and the same action, over the ends of episodes."""
     chosen = torch.full(env.action_spec.shape, action)
     return env.rollout(steps, lambda td: td.set("action", chosen), break_when_any_done=False)
+
+
+def normed():
+    """Observations by the statistics of this environment's own steps."""
+    return VecNormV2(in_keys=["observation"])

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Compose, Transform, VecNorm, VecNormV2
 
 from safe_rl.checks import Checked
 from safe_rl.envs import rng
@@ -329,5 +329,10 @@ def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
         raise TargetError(
             f"transforms.{name}: {given['_target_']} makes a {type(transform).__name__}, which is "
             "no Transform of TorchRL."
+        )
+    if isinstance(transform, VecNorm | VecNormV2):
+        raise TargetError(
+            f"transforms.{name}: evaluations would not have the statistics of training. Use "
+            "model.normalise=10 for observations, RewardScaling for rewards."
         )
     return transform
