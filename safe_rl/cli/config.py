@@ -310,6 +310,8 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
         >>> unknown_key("env.hazard_num", ["env.hazards_num", "env.vases_num"])
         "there is no key 'env.hazard_num'. Did you mean 'env.hazards_num'?"
     """
+    if key.endswith("._target_"):
+        return f"there is no key '{key}': write '+{key}=…' to add it."
     known = [path for path in known if path != key]
     same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
     meant = same or filter(None, [nearest(key, known, 0.7)])

@@ -311,6 +311,7 @@ def make_env(
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.transforms import transform_env
 
+    num_envs = checked("num_envs", Count, num_envs)
     given = dict(num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)  # noqa: C408
     node = dict(env if isinstance(env, Mapping) else env_node(env))
     for key in keys.keys() - node.keys():

@@ -19,6 +19,7 @@ RIGHT = [
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
+    "model._target_=my.nets": r"^there is no key .*: write '\+model\._target_=…' to add it\.$",
     "lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
     "certificate={episodez: 5}": r"Did you mean '\S*certificate\.episodes'",
     "zzzzz=3": "'--cfg job' prints all keys",

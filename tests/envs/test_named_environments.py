@@ -50,7 +50,7 @@ def test_ids_of_the_velocity_family_are_names_too(name):
 
 def test_what_is_stored_is_made_by_its_name(my_family):
     store_config("Crowded", {"robot_base": "point", "hazards_num": 11})
-    assert make_env("Crowded", num_envs=2, seed=0).config.hazards_num == 11
+    assert make_env("Crowded", num_envs=4 / 2, seed=0).config.hazards_num == 11
     keys = {"id": "Walk-v0", "cost_keys": ["fast"], "num_steps": 4}
     store_config("Stroll", {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", **keys})
     assert make_env("Stroll", num_envs=2, seed=0).max_episode_steps == 4
