@@ -8,7 +8,7 @@ import pytest
 from hydra.core.config_store import ConfigStore
 
 from safe_rl import trust
-from safe_rl.envs import ConfigError, ContractError, make_env, store_config
+from safe_rl.envs import ConfigError, ContractError, make_env, store_config, store_configs
 from safe_rl.envs.velocity import VelocityEnv
 from safe_rl.trust import TargetError
 
@@ -16,7 +16,8 @@ from safe_rl.trust import TargetError
 @pytest.fixture(autouse=True)
 def _as_before(monkeypatch):
     """What a test stores and allows is gone afterwards."""
-    group = ConfigStore.instance().repo.setdefault("env", {})
+    store_configs()  # once: later calls store only what has changed
+    group = ConfigStore.instance().repo["env"]
     before = dict(group)
     monkeypatch.setattr(trust, "_ROOMS", dict(trust._ROOMS))
     yield
