@@ -66,9 +66,15 @@ class LimitState:
         length: Tensor | float | None = None,
         is_new: bool = True,
     ) -> LimitState:
-        """The state without a tracker: the target is the limit d, and costs have the unit 1."""
+        """The state without a tracker: the target is the limit d, and costs have the unit 1.
+
+        Raises:
+            ValueError: If there are not as many costs as limits.
+        """
         limit = torch.as_tensor(limit, dtype=torch.float32)
         cost = torch.as_tensor(cost).to(limit)
+        if cost.shape != limit.shape:
+            raise ValueError(f"{cost.numel()} costs and {limit.numel()} limits: give one of each.")
         return cls(
             cost=cost,
             target=limit,

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from safe_rl.algorithms import Constraints
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import PIDMultiplier, PIMultiplier, ProjectedMultiplier, RCPOLoss
-from safe_rl.objectives.limits import LimitTracker, PredictedChange
+from safe_rl.objectives.limits import LimitState, LimitTracker, PredictedChange
 
 SETTINGS = {
     "max_length": 1000,
@@ -239,6 +239,8 @@ def test_another_default_dtype_of_torch_changes_nothing():
 def test_a_loop_of_ones_own_is_told_of_a_limit_below_zero():
     with pytest.raises(ValueError, match=r"cost_limits=.*greater than or equal to 0"):
         Constraints({"cost": -1.0})
+    with pytest.raises(ValueError, match="2 costs and 1 limits"):
+        LimitState.of(cost=[31.0, 2.0], limit=[25.0])
 
 
 def test_batches_of_one_environment_need_their_dimension():
