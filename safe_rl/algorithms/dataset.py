@@ -101,6 +101,8 @@ def _fill(
         )
     costs = [("next", key) for key in env.cost_keys if ("next", key) in steps.keys(True)]
     check_steps({key: steps[key] for key in {*buffer.in_keys, *costs}}, costs)
+    if not is_recorded:
+        _check_meanings(steps, env)
     warning = _arrange(steps, interface, node, env)
     number = steps.batch_size.numel()
     if node.safe_episodes:
@@ -119,6 +121,26 @@ def _fill(
     buffer.end_rows()
     kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
     return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}.{warning}"
+
+
+def _check_meanings(steps: TensorDictBase, env: EnvBase) -> None:
+    """Refuse steps [1, M] of a file whose costs or ends cannot be what they are here."""
+    for key in env.cost_keys:
+        highest = getattr(env.full_reward_spec[key], "high", torch.tensor(math.inf)).max().item()
+        found = float(steps["next"].get(key, torch.zeros(1)).max())
+        if found > highest * (1 + _ROUNDING):
+            raise ValueError(
+                f"its {key} is up to {found:g} in a step, that of this environment {highest:g}. "
+                "Costs are those of single steps, not sums over an episode: rescale or clip them."
+            )
+    ends = steps["next", "done"].flatten().nonzero().flatten()
+    lengths = ends.diff(prepend=ends.new_tensor([-1]))
+    terminated = lengths[steps["next", "terminated"].flatten()[ends]]
+    if len(terminated) > 1 and (terminated == env.max_episode_steps).all():
+        raise ValueError(
+            f"all episodes that terminate have {env.max_episode_steps} steps, so these are "
+            "time-outs, after which values are bootstrapped: mark them in timeouts only."
+        )
 
 
 def _arrange(

@@ -209,18 +209,26 @@ def _read_episodes(path: Path | str, nodes: Mapping[str, Any], names: list[str])
 
 
 def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
-    arrays = _arrays(path, nodes, _FLAT)
+    arrays = _check_shapes(path, _arrays(path, nodes, _FLAT))
+    here = arrays["observation"]
+    ends = (arrays["next", "terminated"] | arrays["next", "truncated"]).reshape(-1)
     if "next_observations" in nodes:
-        following, here = _values(path, nodes["next_observations"]), arrays["observation"]
+        following = _values(path, nodes["next_observations"])
         if np.array_equal(following, here) and (here != here[:1]).any():
             raise ValueError(f"{path}: its next_observations are equal to its observations.")
     else:
-        _check_shapes(path, arrays)
-        here = arrays["observation"]
-        ends = arrays["next", "terminated"] | arrays["next", "truncated"]
-        ends = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
-        following = np.where(ends, here, np.roll(here, -1, 0))
-    return _check_shapes(path, {**arrays, ("next", "observation"): following})
+        is_last = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
+        following = np.where(is_last, here, np.roll(here, -1, 0))
+    _check_shapes(path, {**arrays, ("next", "observation"): following})
+    is_next = np.isclose(following[:-1], here[1:], 1e-4, 1e-6, equal_nan=True)
+    gaps = ~is_next.all(tuple(range(1, here.ndim))) & ~ends[:-1]
+    if gaps.any():
+        raise ValueError(
+            f"{path}: another observation follows its step {gaps.argmax()} than next_observations "
+            "says, and no episode ends there. Put steps in order of time, and mark every end of an "
+            "episode in terminals or timeouts."
+        )
+    return {**arrays, ("next", "observation"): following}
 
 
 def _read_episode(place: str, group: Any) -> Arrays:

@@ -126,6 +126,21 @@ def test_actions_of_a_file_are_in_the_environment_s_units(action, told, tmp_path
         learned_actions(tmp_path / "data.hdf5", env)
 
 
+def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
+    path = tmp_path / "data.hdf5"
+    write_episodes(path, "Battery-v0", 1.0, episodes=2)
+    with h5py.File(path, "a") as file:
+        file["terminals"][...] = file["timeouts"][:]
+    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"})
+    with pytest.raises(ValueError, match="all episodes that terminate have 10 steps, so these are"):
+        learned_actions(path, env)
+    write_episodes(path, "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
+    with h5py.File(path, "a") as file:
+        file["costs"][...] = np.arange(8)  # summed over the episode
+    with pytest.raises(ValueError, match="its cost is up to 7 in a step, that of this environment"):
+        learned(path, make_env("PointGoal1", num_envs=1, seed=0))
+
+
 def test_recorded_actions_are_those_of_the_policy(tmp_path):
     """A policy drew actions beyond its bounds, and the environment clipped them."""
     env = make_env(

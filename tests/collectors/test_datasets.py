@@ -116,8 +116,9 @@ def test_an_episode_at_exactly_the_limit_is_safe():
 
 def write_hdf5(h5py, path, size=6, leave_out=()):
     rng = np.random.default_rng(0)
+    seen = rng.normal(size=(size + 1, 3))
     arrays = {
-        "observations": rng.normal(size=(size, 3)), "next_observations": rng.normal(size=(size, 3)),
+        "observations": seen[:-1], "next_observations": seen[1:],
         "actions": rng.normal(size=(size, 2)), "rewards": rng.normal(size=size),
         "costs": rng.integers(0, 2, size).astype(float), "terminals": np.arange(size) == 2,
         "timeouts": np.arange(size) == size - 1,
@@ -210,6 +211,7 @@ def test_what_is_no_dataset_is_refused(tmp_path, h5py):
         ({"costs": np.zeros((6, 2))}, r"the next cost must be numbers of shape \(6,\), as"),
         ({"next_observations": np.zeros((6, 4))}, r"numbers of shape \(6, 3\),.* shape \(6, 4\)"),
         ({"next_observations": "observations"}, "next_observations are equal to its observations"),
+        ({"next_observations": np.ones((6, 3))}, "another observation follows its step 0 than"),
     ],
 )
 def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path, h5py):
