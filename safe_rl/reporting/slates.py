@@ -81,7 +81,8 @@ def _record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
             names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
             record |= zip(names, interquartile_mean(strata[name]), strict=True)
     paper = benchmark.PUBLISHED.get(slate, {}).get(experiments[0].base)
-    if paper and all(e.is_published_problem for e in experiments):
+    is_whole = len(experiments) == len(benchmark.SLATES.get(slate, ()))
+    if paper and is_whole and all(e.is_published_problem for e in experiments):
         record |= {f"paper_{name}": value for name, value in paper._asdict().items()}
     return record
 
@@ -150,8 +151,8 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
     }
     kept = [{k: v for k, v in row.items() if k != "there"} for row in rows]
     note = (
-        "Averages over the environments that there are; the paper's are over all of a slate, after "
-        "10,000,000 steps (Doggo: 100,000,000). Only complete rows can be compared with them."
+        "Averages over the environments that there are; the paper's, over all of a slate after "
+        "10,000,000 steps (Doggo: 100,000,000), stand only beside complete rows."
     )
     return Table("paper", "The paper's Tables 1 and 2", columns, kept, note)
 
