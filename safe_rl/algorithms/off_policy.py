@@ -124,7 +124,7 @@ class OffPolicy(Resumable, Algorithm):
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
-        policy = exploring(networks["actor"], env, config.exploration.get("noise", 0.0))
+        policy = exploring(networks["actor"], env, config.exploration.noise)
         if policy.noise and policy.samples:
             raise ValueError(
                 f"exploration.noise={policy.noise}: the policy of algo={config.algo.name} samples "

@@ -44,7 +44,8 @@ RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
 COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
-    *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
+    # Hydra's of logger=null and model=[1], OmegaConf's of missing sections
+    *(ValueError, TypeError, AttributeError),
 )
 
 
@@ -111,10 +112,10 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
     if "algo" in choices:
         config.algo.name = choices["algo"].rpartition("/")[2]
     name, chosen = config.env.name, choices.get("env")
-    if chosen is None or name == chosen or name not in env_names():
+    if chosen is None or name == chosen:
         return
-    config.env.name = env_name(name, chosen)
-    if config.env.name == name:
+    config.env.name = env_name(name, chosen, hydra.runtime.config_sources)
+    if config.env.name == name and name in env_names():
         raise ValueError(
             f"env.name={name} would train env={chosen} under the name of another environment. To "
             f"choose that one, write env={name}."
@@ -156,7 +157,7 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     """What is wrong with a command, in one line that names the nearest right word.
 
     Raises:
-        AttributeError: The error, if it is one that no word explains.
+        AttributeError, TypeError: The error, if it is one that no word explains.
     """
     if isinstance(error, OverrideParseException):
         return unreadable(str(error.override), error)
@@ -164,6 +165,11 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         return _unknown_choice(error)
     if str(error).startswith("Config group override must be"):
         return _unnamed_choice(words) or str(error)
+    if isinstance(error, TypeError):
+        lists = [word for word in words if re.match(r"\w+=\[[^\]]*\b\d", word)]
+        if not lists:
+            raise error
+        return f"{lists[0]}: this is no list of names of files."
     if type(error) is AttributeError:
         missing = re.search(r"full_key: (\w+)\.\S+\s+object_type=General", str(error))
         if missing is None:

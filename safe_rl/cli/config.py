@@ -75,7 +75,7 @@ class Critics:
     """Sizes of the ensembles of Q functions: the section ``critics``."""
 
     rewards: Annotated[int, Interval(ge=0, le=1000)]  # number of Q functions of the reward
-    costs: Annotated[int, Interval(ge=0, le=1000)] = 0  # number of Q functions of the costs
+    costs: Annotated[int, Interval(ge=0, le=1000)]  # number of Q functions of the costs
     cost_values: Any = None  # what a Q function of the costs returns; null: the mean
 
 
@@ -85,7 +85,7 @@ class Exploration:
 
     random_steps: Annotated[Any, typed(NonNegativeInt)]  # random steps at the beginning
     # standard deviation of a deterministic policy's noise, in half ranges of actions
-    noise: NonNegativeFloat = 0.0
+    noise: NonNegativeFloat
 
 
 @dataclass

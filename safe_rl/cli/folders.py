@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
 from safe_rl.envs.families import env_names
 
 
-def env_name(name: str, chosen: str) -> str:
+def env_name(name: str, chosen: str, sources: Iterable[Any] = ()) -> str:
     """Name of an environment whose configuration has the name `name` and was chosen as `chosen`.
 
-    A file of the user's that builds on an environment of the package is not that environment.
+    A file of the user's that builds on another environment, of the package or of another file in
+    one of Hydra's sources, is not that environment.
 
     Examples:
         >>> env_name("PointGoal1", "my_level"), env_name("Dense", "my_level")
         ('my_level', 'Dense')
     """
-    is_of_another = name in env_names() and chosen not in env_names()
+    files = (Path(s.path, "env", f"{name}.yaml") for s in sources if s.schema == "file")
+    is_taken = name in env_names() or any(file.is_file() for file in files)
+    is_of_another = is_taken and chosen not in env_names()
     return chosen if is_of_another else name
 
 

@@ -123,7 +123,7 @@ def _hint_of_grammar(text: str) -> str:
         return " Names within braces have no quotes: '{cost: 10}'."
     if text.count("{") != text.count("}"):
         return " Put values with spaces in quotes: cost_limits='{cost: 10}'."
-    if re.search(r"[^\x20-\x7e]|[ \[\](){}$,]", text.partition("=")[2]):
+    if re.search(r"[^\x20-\x7e]|[ \[\](){}$,=]", text.partition("=")[2]):
         key, _, value = text.partition("=")
         if value[:1] in ("{", "["):
             return " Within it, texts with such characters need quotes: \"labels={a: 'A (b)'}\"."

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +104,11 @@ def prepare(words: Sequence[str]) -> list[str]:
             )
         new.append(f"env={','.join(SLATES[name])}")
     # Hydra's parser of flags takes overrides only where they stand together
-    overrides = (i for i, word in enumerate(words) if re.match("[^-=][^=]*=", word))
+    overrides = (
+        place
+        for place, (before, word) in enumerate(pairwise(["", *words]))
+        if re.match("[^-=][^=]*=", word) and not re.fullmatch("-c[dp]|--config-(dir|path)", before)
+    )
     place = next(overrides, 0)
     return [*words[:place], *new, *words[place:]]
 

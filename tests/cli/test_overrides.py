@@ -3,6 +3,9 @@
 import pytest
 from commands import composed
 
+from safe_rl.cli import train
+from safe_rl.scores.benchmark import SLATES
+
 RIGHT = [
     ["-m", "env=PointGoal1,CarGoal2", "env.hazards_num=3,4", "seed=range(3)", "+note=a,b"],
     ["algo=trpo_lagrangian", "lagrangian=adam", "lagrangian.lr=0.1", "cost_limits={cost: 3}"],
@@ -40,6 +43,8 @@ WRONG = {
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
+    "hydra.run.dir=a=b": r"cannot be read.*quotes: \"hydra\.run\.dir='a=b'\"\.$",
+    "model=[1]": r"^model=\[1\]: this is no list of names of files\.$",
     "PointGoal1": r"cannot be read.* written key=value, such as env=PointGoal1\.$",
     "note={a: A (b)}": r"cannot be read.* need quotes: \"labels={a: 'A \(b\)'}\"\.$",
     "init_from=my run (1)": r"cannot be read.*quotes: \"init_from='my run \(1\)'\"\.$",
@@ -55,6 +60,11 @@ lagrangian:
 @pytest.mark.parametrize("arguments", RIGHT, ids=" ".join)
 def test_right_words_pass(arguments):
     composed(*arguments)
+
+
+def test_the_value_of_a_flag_is_no_override():
+    words = ["--config-dir", "a=b", "slate=SG6", "seed=0"]
+    assert train.prepare(words) == [*words[:2], f"env={','.join(SLATES['SG6'])}", "seed=0"]
 
 
 @pytest.mark.parametrize("argument", WRONG)
@@ -123,6 +133,10 @@ def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
     assert (config.algo.name, config.env.hazards_num, config.lagrangian.init) == ("mine", 3, 0.1)
     assert config.hydra.run.dir.startswith("runs/Nearby/mine/")
     assert config.hydra.sweep.subdir.startswith("Nearby/mine/")
+    (tmp_path / "env" / "Nearby.yaml").write_text("defaults: [PointGoal1]\nname: Nearby\n")
+    (tmp_path / "env" / "Crowd.yaml").write_text("defaults: [Nearby]\nhazards_num: 20\n")
+    (config,) = composed(folder, "env=Crowd")
+    assert config.env.name == config.hydra.run.dir.split("/")[1] == "Crowd"
     for wrong, meant in {
         "algo=mime": "Did you mean 'mine'",
         "env=Nearbye": "Did you mean 'Nearby'",
