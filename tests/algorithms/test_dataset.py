@@ -89,13 +89,18 @@ def test_a_clone_does_in_the_raw_environment_what_the_file_says(family, tmp_path
     assert own.median().item() == pytest.approx(action, abs=0.05)
 
 
-def learned(path, env, *overrides, name="PointGoal1"):
-    """The replay buffer of a clone of a dataset."""
+def learner(path, env, *overrides, name="PointGoal1"):
+    """A learner with a dataset in its replay buffer."""
     config = compose_config(
         *("algo=bc", f"env={name}", f"dataset.path={path}", "cost_limits={cost: 1e6}"),
         *("model.hidden_sizes=[8]", "memory.batch_size=4", *overrides),
     )
-    return torch.cat([*OffPolicy.from_config(config, env).replay_buffer.minibatches(20)])
+    return OffPolicy.from_config(config, env)
+
+
+def learned(*given, **named):
+    """Steps of its replay buffer."""
+    return torch.cat([*learner(*given, **named).replay_buffer.minibatches(20)])
 
 
 def learned_actions(path, env):
@@ -137,8 +142,12 @@ def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
     write_episodes(path, "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
     with h5py.File(path, "a") as file:
         file["costs"][...] = np.arange(8)  # summed over the episode
+    env = make_env("PointGoal1", num_envs=1, seed=0)
     with pytest.raises(ValueError, match="its cost is up to 7 in a step, that of this environment"):
-        learned(path, make_env("PointGoal1", num_envs=1, seed=0))
+        learned(path, env)
+    with h5py.File(path, "a") as file:
+        file["costs"][...] = 2.0  # of two kinds at once
+    assert "it may be the sum of several kinds" in learner(path, env).learns_from
 
 
 def test_recorded_actions_are_those_of_the_policy(tmp_path):
