@@ -206,7 +206,7 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         >>> locate("torch.load", key="loss._target_")
         Traceback (most recent call last):
         ...
-        safe_rl.trust.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command, in Python imports='torch' or safe_rl.trust.import_modules('torch').
+        safe_rl.trust.TargetError: loss._target_=torch.load: configurations reach only parts of safe_rl, torch.optim and modules of yours. If you trust 'torch', add import=torch to the command (in Python: imports='torch', or safe_rl.trust.import_modules('torch')).
     """  # noqa: E501
     name = " ".join(str(target).split())  # in one line, as messages show it
     shown = f"{key}={name}" if key else name
@@ -216,8 +216,8 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
         module = name.rpartition(".")[0] or name
         raise TargetError(
             f"{shown}: configurations reach only parts of safe_rl, torch.optim and modules of "
-            f"yours. If you trust '{module}', add {quote(f'import={module}')} to the command, in "
-            f"Python imports='{module}' or safe_rl.trust.import_modules('{module}')."
+            f"yours. If you trust '{module}', add {quote(f'import={module}')} to the command (in "
+            f"Python: imports='{module}', or safe_rl.trust.import_modules('{module}'))."
         )
     known, part = _ROOMS[root], name.removeprefix(f"{root}.")
     if known is not None and part not in known:

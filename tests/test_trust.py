@@ -154,7 +154,7 @@ def test_modules_are_not_imported_to_be_refused(tmp_path, monkeypatch):
         "import pathlib; pathlib.Path(__file__).with_name('trace').touch()\nclass Loss: ..."
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(TargetError, match="add import=strange_module to the command, in Python"):
+    with pytest.raises(TargetError, match=r"add import=strange_module to the command \(in Python"):
         instantiate({"_target_": "strange_module.Loss"})
     assert not (tmp_path / "trace").exists()
 

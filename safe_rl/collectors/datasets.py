@@ -212,14 +212,13 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
     arrays = _check_shapes(path, _arrays(path, nodes, _FLAT))
     here = arrays["observation"]
     ends = (arrays["next", "terminated"] | arrays["next", "truncated"]).reshape(-1)
-    if "next_observations" in nodes:
-        following = _values(path, nodes["next_observations"])
-        if np.array_equal(following, here) and (here != here[:1]).any():
-            raise ValueError(f"{path}: its next_observations are equal to its observations.")
-    else:
+    if "next_observations" not in nodes:
         is_last = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
-        following = np.where(is_last, here, np.roll(here, -1, 0))
-    _check_shapes(path, {**arrays, ("next", "observation"): following})
+        return {**arrays, ("next", "observation"): np.where(is_last, here, np.roll(here, -1, 0))}
+    following = _values(path, nodes["next_observations"])
+    arrays = _check_shapes(path, {**arrays, ("next", "observation"): following})
+    if np.array_equal(following, here) and (here != here[:1]).any():
+        raise ValueError(f"{path}: its next_observations are equal to its observations.")
     is_next = np.isclose(following[:-1], here[1:], 1e-4, 1e-6, equal_nan=True)
     gaps = ~is_next.all(tuple(range(1, here.ndim))) & ~ends[:-1]
     if gaps.any():
@@ -228,7 +227,7 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
             "says, and no episode ends there. Put steps in order of time, and mark every end of an "
             "episode in terminals or timeouts."
         )
-    return {**arrays, ("next", "observation"): following}
+    return arrays
 
 
 def _read_episode(place: str, group: Any) -> Arrays:

@@ -318,7 +318,8 @@ def make_env(
         if meant := did_you_mean(key, [*given, "transforms"], 0.85):
             raise ConfigError(f"There is no argument '{key}'.{meant}")
     node |= keys
-    target, _ = node.pop("_target_", None), node.pop("name", None)
+    target = node.pop("_target_", None)
+    node.pop("name", None)
     build: Any = SafetyGymEnv if target is None else locate(target, key="env._target_")
     try:
         signature(build).bind(node, **given)

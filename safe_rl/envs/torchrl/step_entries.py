@@ -103,10 +103,10 @@ class StepCosts(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         costs = self._costs(tensordict.clone(False).set("next", next_tensordict))
         done = next_tensordict["done"]
+        # where an environment writes `done` alone, `SerialEnv` leaves `terminated` False
         ended = done & ~next_tensordict.get("truncated", torch.zeros_like(done))
-        # `SerialEnv` leaves it false where an environment writes `done` alone
-        costs["terminated"] = next_tensordict["terminated"] | ended
-        return next_tensordict.exclude(*self._entries.values()).update(costs)
+        written = {**costs, "terminated": next_tensordict["terminated"] | ended}
+        return next_tensordict.exclude(*self._entries.values()).update(written)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
