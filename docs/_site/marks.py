@@ -1,4 +1,4 @@
-"""What pages ask for: between `<!-- made: name words -->` and `<!-- end -->`, tables and files.
+"""What pages ask for: tables, between `<!-- made: name words -->` and `<!-- end -->`.
 
 ``python docs/_site/marks.py`` writes all of them again, from the program and from ``results/``.
 """
@@ -20,20 +20,12 @@ _MARK = re.compile(
 _HEAD = "| `algo=` | problem it solves | policy step | source |\n|---|---|---|---|"
 
 
-def conf(names: str) -> str:
-    """Files of ``conf/`` as they are: their comments explain every key."""
-    paths = [path for name in names.split() for path in sorted((ROOT / "conf").glob(name))]
-    assert paths, f"there is no conf/{names}"
-    blocks = [f"`{path.relative_to(ROOT)}`:\n\n```yaml\n{path.read_text()}```" for path in paths]
-    return "\n\n".join(blocks)
-
-
 def listed(kind: str) -> str:
     """Problem, policy step and source of the algorithms of a kind, as their pages say."""
     rows = []
     for page in sorted(PAGES.glob("*.md")):
         short = re.search(r"^<!-- row: (.*) -->$", text := page.read_text(), re.M)
-        source = re.search(r"^`algo=\w+` · (.*)$", text, re.M)
+        source = re.search(r"^\[`algo=\w+`\]\(\S+\) · (.*)$", text, re.M)
         has_buffer = re.search(r"made: columns .*memory", text) is not None
         if short and source and has_buffer == (kind == "OffPolicy"):
             rows.append(f"| [`{page.stem}`]({page.name}) | {short[1]} | {source[1]} |")
@@ -49,7 +41,7 @@ def columns(names: str) -> str:
     return "\n".join([head, "|---|---|", *rows])
 
 
-_ALL = (conf, listed, columns, *environment_tables.TABLES, *result_tables.TABLES)
+_ALL = (listed, columns, *environment_tables.TABLES, *result_tables.TABLES)
 TABLES: dict[str, Callable[..., str]] = {table.__name__: table for table in _ALL}
 
 
