@@ -311,8 +311,8 @@ def make_env(
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.transforms import transform_env
 
-    num_envs = checked("num_envs", Count, num_envs)
-    given = dict(num_envs=num_envs, device=device, seed=seed, num_threads=num_threads)  # noqa: C408
+    count = checked("num_envs", Count, num_envs)
+    given = {"num_envs": count, "device": device, "seed": seed, "num_threads": num_threads}
     node = dict(env if isinstance(env, Mapping) else env_node(env))
     for key in keys.keys() - node.keys():
         if meant := did_you_mean(key, [*given, "transforms"], 0.85):

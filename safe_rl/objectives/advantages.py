@@ -213,7 +213,7 @@ class CostGAE(VectorGAE):
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 
     Raises:
-        ValueError: If ``cost_keys`` is empty.
+        ValueError: If ``cost_keys`` is empty, or a text.
 
     Examples:
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
@@ -242,6 +242,6 @@ class CostGAE(VectorGAE):
         **settings: Any,
     ) -> None:
         super().__init__(value_network, **settings)
-        if not cost_keys:
-            raise ValueError("cost_keys must name at least one cost.")
+        if not cost_keys or isinstance(cost_keys, str):
+            raise ValueError("cost_keys must be a list with at least one cost, such as ['cost'].")
         self.set_keys(reward=list(cost_keys))

@@ -199,8 +199,11 @@ def test_nodes_are_built_and_their_keys_named():
     torch.manual_seed(0)
     assert env.rollout(4)["next", "cost_interventions"].all()
     wrong = {**node, "filter": {"_target_": "transforming.half_spe", "_partial_": True}}
-    with pytest.raises(TargetError, match=r"transforms.slow: .*half_spe"):
+    with pytest.raises(TargetError, match=r"transforms\.slow\.filter\._target_=.*half_spe"):
         make_env({"robot_base": "point"}, transforms={"slow": wrong})
+    late = {"_target_": "safe_rl.envs.transforms.ActionDelay", "steps": -1}
+    with pytest.raises(ValueError, match=r"^transforms\.late\.steps=-1: it must be"):
+        make_env("PointGoal1", transforms={"late": late})
     loss = {"_target_": "safe_rl.objectives.LagrangeMultiplier", "init": 1.0, "lr": 0.1}
     loss["cost_limits"] = {"cost": 25.0}
     with pytest.raises(TargetError, match="no Transform"):

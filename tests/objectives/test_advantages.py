@@ -114,8 +114,9 @@ def test_errors_say_what_to_change():
     settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
     with pytest.raises(ValueError, match="lambda_return"):
         VectorGAE(None, **{**settings, "value_target": "montecarlo"})
-    with pytest.raises(ValueError, match="cost_keys must name"):
-        CostGAE([], None, **settings)
+    for keys in ([], "cost_hazard"):
+        with pytest.raises(ValueError, match="cost_keys must be a list"):
+            CostGAE(keys, None, **settings)
     cost = CostGAE(["cost_hazard"], make_critic("cost_value"), **settings)
     rollout = make_rollout([], costs=("cost_hazards", "cost_vases"))
     with pytest.raises(KeyError, match=r"Did you mean \('next', 'cost_hazards'\)"):

@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
@@ -321,10 +322,9 @@ def _repeating(transforms: Mapping[str, Transform]) -> str | None:
 def _transform(name: str, given: Transform | Mapping[str, Any]) -> Transform:
     if isinstance(given, Transform):
         return given
-    try:
-        transform = instantiate(given)
-    except TargetError as error:
-        raise TargetError(f"transforms.{name}: {error}") from error
+    # messages have the full key of the node
+    node = OmegaConf.create({"transforms": {name: given}}, flags={"allow_objects": True})
+    transform = instantiate(node.transforms[name])
     if not isinstance(transform, Transform):
         raise TargetError(
             f"transforms.{name}: {given['_target_']} makes a {type(transform).__name__}, which is "
