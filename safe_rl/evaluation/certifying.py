@@ -204,8 +204,9 @@ def _run(
     A round of the ranking is one batch. In a batch of a test every environment has one episode, so
     short episodes do not count before long ones. Every batch has new instances of the environment:
     episodes of one instance are not independent if it draws constants when it is made. Only a fixed
-    layout, which is such a constant, is kept. Checkpoints of one call share one simulation; those
-    of several calls have the same layouts. Costs come with the highest possible ones of an episode.
+    layout, which is such a constant, is kept, and all else drawn anew. Checkpoints of one call
+    share one simulation; those of several calls have the same layouts. Costs come with the highest
+    possible ones of an episode.
     """
     evaluation, together = evaluations[0], len(evaluations)
     run_seed, is_fixed = evaluation.seed, has_fixed_layout(evaluation.node)
@@ -218,9 +219,12 @@ def _run(
         for part in range(math.ceil(number / batch)):
             if part == 0 or not is_fixed:
                 stack.close()
-                seed = run_seed if is_fixed else run_seed + seed_offset + part * _NEXT_BATCH
-                changed = replace(evaluation, options=replace(evaluation.options, seed=seed))
+                seed = run_seed + seed_offset + part * _NEXT_BATCH
+                of_layout = run_seed if is_fixed else seed
+                changed = replace(evaluation, options=replace(evaluation.options, seed=of_layout))
                 env = stack.enter_context(closing(changed.make(worlds * together)))
+                if is_fixed:
+                    _seed_without_layout(env, seed)
                 policy = _side_by_side([each.policy(env) for each in evaluations])
                 highest = {key: env.highest_cost(key) for key in keys}
             collected = collect_episodes(
@@ -237,6 +241,14 @@ def _run(
                 ],
             )
             bar.update(batch)
+
+
+def _seed_without_layout(env: EnvBase, seed: int) -> None:
+    """Seed all draws of an environment except for its fixed layout, if its state has one."""
+    state = env.get_state()
+    if state is not None and "fixed_layout" in state:
+        env.set_seed(seed)
+        env.set_state(env.get_state().set("fixed_layout", state["fixed_layout"]))
 
 
 def _side_by_side(policies: list[TensorDictModuleBase]) -> Callable[..., TensorDictBase]:

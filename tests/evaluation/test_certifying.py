@@ -305,6 +305,26 @@ def test_a_fixed_layout_is_certified_as_it_was_learned(train):
     assert 3 not in met
 
 
+def test_on_a_fixed_layout_the_test_has_other_episodes_than_the_ranking(monkeypatch):
+    layouts = []
+
+    def still(evaluation, env):
+        env.reset()
+        layouts.append(env.get_state()["layout"])
+        return lambda state: state.set("action", torch.zeros(len(state), 2))
+
+    def make(node, **keys):
+        noisy = {"num_steps": 5, "randomize_layout": False, "action_noise": 0.5}
+        return envs.make_env("PointGoal1", **noisy, **keys)
+
+    monkeypatch.setattr(PolicyEvaluation, "policy", still)
+    config = point_mass_config("cost_limits={cost: 19}", "+env.randomize_layout=false")
+    evaluation = PolicyEvaluation(config, Path("0"), EvaluationOptions(num_threads=1), make)
+    ranked, tested = (next(_run([evaluation], use, 4, False))[1][0] for use in (_RANKING, _TEST))
+    assert (ranked.returns != tested.returns).all()
+    torch.testing.assert_close(*layouts)
+
+
 def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train):
     met = {}
 
