@@ -212,7 +212,8 @@ class LimitTracker(Checked, Resumable):
         frames: Environment steps of the whole run.
         latest_end: Share of the run at which the descent ends at the latest. In a shorter run,
             free_steps and descent_steps are reduced in proportion.
-        smallest_scale: Lower bound of the unit of violations, in costs per step, for limits near 0.
+        smallest_scale: Lower bound of the unit of violations, for limits near 0: number of costs of
+            size `LimitState.unit` per time step of a batch.
         drift: Expected relative change of J_c per update, see `EpisodeCosts`; None uses each batch
             alone.
         decay: Weight of the past in the averages of a batch's standard error and of trust_<cost>.
@@ -265,7 +266,7 @@ class LimitTracker(Checked, Resumable):
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
         self.decay, self.steps_per_decision = decay, steps_per_decision
-        self.smallest_scale = smallest_scale * steps_per_decision  # per time step of a batch
+        self.smallest_scale = smallest_scale
         self.costs = EpisodeCosts(
             num_costs,
             max_length=max_length,

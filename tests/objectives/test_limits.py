@@ -103,6 +103,13 @@ def test_a_limit_of_0_has_a_unit_and_no_margin():
     assert state.violation > 20
 
 
+def test_a_limit_that_is_not_near_0_stays_the_unit_where_actions_are_held():
+    """Held for 4 steps, a cost of 0 or 1 per step is up to 4 per decision."""
+    limits = tracker(25.0, max_length=250, steps_per_decision=4)
+    state = limits.update(*batches(1, 0.03, unit=4.0), NO_EPISODES)
+    assert (state.unit, state.scale) == (4, 25)
+
+
 def test_a_cost_and_a_limit_ten_times_as_large_give_the_same_picture():
     small, large = tracker(25.0), tracker(250.0)
     for costs, scaled in zip(batches(12, 0.06), batches(12, 0.06, unit=10.0), strict=True):
