@@ -143,7 +143,7 @@ class Constraints(Resumable):
         if self.risk is not None:
             self._penalise(batch, costs.cpu(), episodes)
         state = self.tracker.update(costs, episodes.decisions, self._penalised)
-        return state.to(self.limits.device)
+        return state.to(self.limits)
 
     def _compare_episodes(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> LimitState:
         """Compare the mean of finished episodes with d.

@@ -137,12 +137,10 @@ class LimitState:
             )
         return self.length.to(surrogates)
 
-    def to(self, device: torch.device) -> LimitState:
-        """The same on another device."""
+    def to(self, like: Tensor) -> LimitState:
+        """The same with the dtype and device of a tensor."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        tensors: dict[str, Any] = {
-            k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)
-        }
+        tensors: dict[str, Any] = {k: v.to(like) for k, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **tensors)
 
 

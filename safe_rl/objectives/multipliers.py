@@ -124,7 +124,7 @@ class Multiplier(Checked, nn.Module, ABC):
                 f"update() needs one violation for each of {self.cost_keys}, "
                 f"got shape {tuple(state.violation.shape)}."
             )
-        state = state.to(self.limits.device)
+        state = state.to(self.limits)
         known = state.violation.isfinite() & state.is_new
         for name, new in self._step(state).items():
             buffer = self.get_buffer(name)

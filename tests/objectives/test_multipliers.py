@@ -77,7 +77,9 @@ def test_moves_and_has_nothing_to_train():
     assert multiplier.value.device.type == "meta"
     assert not list(multiplier.parameters())
     assert not multiplier.value.requires_grad
-    assert lagrange().double().value.dtype == torch.float64
+    multiplier = lagrange().double()
+    multiplier.update(limit_state(10.0))  # float32, as `Constraints.update` returns it
+    assert multiplier.value.dtype == torch.float64
 
 
 @pytest.mark.parametrize(
