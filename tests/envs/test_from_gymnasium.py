@@ -223,6 +223,11 @@ def test_a_copy_continues_as_the_original_does(copied):
         assert torch.equal(got["next", key], expected["next", key])
 
 
+def test_a_new_environment_can_be_copied():
+    env = from_gymnasium(lambda: Walk(), num_steps=7, cost_keys=["fast", "far"], seed=1)
+    assert copy.deepcopy(env).rollout(2).shape == (1, 2)
+
+
 @pytest.mark.parametrize(
     ("given", "arguments", "told"),
     [

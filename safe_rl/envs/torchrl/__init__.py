@@ -76,6 +76,7 @@ class TorchRLEnv(ConstrainedEnv, TransformedEnv):
         self.observation_layout = observe.layout
         self.privileged_layout = observe.privileged_layout
         self.max_episode_steps = int(config["num_steps"])
+        _ = self.action_spec  # `ActionScaling` reads it, and cannot be copied before
 
     @property
     def action_bounds(self) -> tuple[Tensor, Tensor] | None:
