@@ -140,7 +140,9 @@ class LimitState:
     def to(self, like: Tensor) -> LimitState:
         """The same with the dtype and device of a tensor."""
         values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        tensors: dict[str, Any] = {k: v.to(like) for k, v in values.items() if isinstance(v, Tensor)}
+        tensors: dict[str, Any] = {
+            k: v.to(like) for k, v in values.items() if isinstance(v, Tensor)
+        }
         return replace(self, **tensors)
 
 
