@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from train_throughput import compose_config, new_env
 
 from safe_rl.evaluation import collect_episodes
-from safe_rl.runs.figures import feasible_return
+from safe_rl.runs.table import feasible_return
 from safe_rl.scores.certificate import Claim
 from safe_rl.training.building import build_trainer, seed_everything
 

@@ -31,7 +31,6 @@ API = {
     "safe_rl.scores.comparisons": "Intervals",
     "safe_rl.reporting": "Reports",
     "safe_rl.runs.table": "Tables of runs",
-    "safe_rl.runs.figures": "Figures of runs",
 }
 
 

@@ -24,11 +24,11 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.cli.composing import name_choices
 from safe_rl.cli.config import check_settings
 from safe_rl.files import replace_text
-from safe_rl.runs.figures import violation
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import differences, is_to_keep_limits
-from safe_rl.runs.progress_bar import LINE_SECONDS
 from safe_rl.runs.run import Run
+from safe_rl.runs.table import violation
+from safe_rl.runs.writing import LINE_SECONDS
 from safe_rl.trust import import_modules
 
 _GRACE = 30.0

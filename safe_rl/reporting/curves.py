@@ -26,7 +26,7 @@ from safe_rl.reporting.figures import (
 )
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.curves import moving_mean
-from safe_rl.runs.figures import final_width
+from safe_rl.runs.table import final_width
 from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import t_interval
 

@@ -13,7 +13,7 @@ import numpy as np
 from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval, mark_best, spread
-from safe_rl.runs.figures import FINAL_EPOCHS, final_rows, final_width
+from safe_rl.runs.table import FINAL_EPOCHS, final_rows, final_width
 from safe_rl.scores import benchmark
 from safe_rl.scores.bounds import rounded_up
 

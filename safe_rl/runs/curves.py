@@ -15,7 +15,7 @@ from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import Bbox, ScaledTranslation
 
 from safe_rl.files import replacing
-from safe_rl.runs.figures import final_width
+from safe_rl.runs.table import final_width
 
 _TO_LEGEND = -0.45  # from a panel to its legend, past ticks and the label [inch]
 

@@ -14,10 +14,9 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
-from safe_rl.runs.figures import final_figures, measured, outcome_line
 from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
 from safe_rl.runs.identity import measure_of, unusable_keys
-from safe_rl.runs.table import MOST_BYTES, read_table
+from safe_rl.runs.table import MOST_BYTES, final_figures, measured, outcome_line, read_table
 
 KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
 from safe_rl.resumable import Resumable
-from safe_rl.runs.figures import feasible_return
+from safe_rl.runs.table import feasible_return
 
 # most epochs to wait: waiting policies are in main memory and in every checkpoint
 _LONGEST = 10

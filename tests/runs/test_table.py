@@ -10,13 +10,13 @@ from safe_rl.runs.table import TableError, TableWriter, read_table
 
 def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
     path = tmp_path / "progress.csv"
-    with TableWriter(path) as table:
-        table.write({"epoch": 1, "return": 0.1 + 0.2, "cost": math.nan})
-        with path.open() as file:
-            assert list(csv.DictReader(file)) == [
-                {"epoch": "1", "return": "0.30000000000000004", "cost": ""}
-            ]
-        table.write({"epoch": 2, "return": -1e-12, "cost": 25.0})
+    table = TableWriter(path)
+    table.write({"epoch": 1, "return": 0.1 + 0.2, "cost": math.nan})
+    with path.open() as file:
+        assert list(csv.DictReader(file)) == [
+            {"epoch": "1", "return": "0.30000000000000004", "cost": ""}
+        ]
+    table.write({"epoch": 2, "return": -1e-12, "cost": 25.0})
     columns = read_table(path)
     assert columns["epoch"] == [1.0, 2.0]
     assert columns["return"] == [0.1 + 0.2, -1e-12]
@@ -25,25 +25,25 @@ def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
 
 
 def test_columns_may_not_change(tmp_path):
-    with TableWriter(tmp_path / "progress.csv") as table:
-        table.write({"epoch": 1, "kl": 0.01})
-        with pytest.raises(ValueError, match=r"\['extra'\]"):
-            table.write({"epoch": 2, "kl": 0.01, "extra": 0.0})
-        with pytest.raises(ValueError, match="same order"):
-            table.write({"kl": 0.01, "epoch": 2})
+    table = TableWriter(tmp_path / "progress.csv")
+    table.write({"epoch": 1, "kl": 0.01})
+    with pytest.raises(ValueError, match=r"\['extra'\]"):
+        table.write({"epoch": 2, "kl": 0.01, "extra": 0.0})
+    with pytest.raises(ValueError, match="same order"):
+        table.write({"kl": 0.01, "epoch": 2})
 
 
 def test_a_continued_table_keeps_the_rows_it_is_told_to(tmp_path):
     path = tmp_path / "progress.csv"
-    with TableWriter(path) as table:
-        for epoch in range(1, 6):
-            table.write({"epoch": epoch})
-    with TableWriter(path, keep_rows=3) as table:
-        table.write({"epoch": 40})
-        with pytest.raises(ValueError, match="other"):
-            table.write({"other": 1})
+    table = TableWriter(path)
+    for epoch in range(1, 6):
+        table.write({"epoch": epoch})
+    table = TableWriter(path, keep_rows=3)
+    table.write({"epoch": 40})
+    with pytest.raises(ValueError, match="other"):
+        table.write({"other": 1})
     assert read_table(path)["epoch"] == [1, 2, 3, 40]
-    TableWriter(path).close()
+    TableWriter(path)
     with pytest.raises(ValueError, match="has not finished an epoch"):
         read_table(path)
 
@@ -76,14 +76,9 @@ def test_a_row_that_is_cut_off_is_no_row(tmp_path):
 )
 def test_a_table_that_was_changed_is_told_in_a_line(change, message, tmp_path):
     path = tmp_path / "progress.csv"
-    with TableWriter(path) as table:
-        for epoch in (1, 2):
-            table.write({"epoch": epoch, "steps": 10 * epoch})
+    table = TableWriter(path)
+    for epoch in (1, 2):
+        table.write({"epoch": epoch, "steps": 10 * epoch})
     path.write_bytes(change(path.read_bytes()))
-
-    def go_on():
-        with TableWriter(path, keep_rows=2) as table:
-            table.write({"epoch": 3, "steps": 30})
-
     with pytest.raises(TableError, match=message):
-        go_on()
+        TableWriter(path, keep_rows=2).write({"epoch": 3, "steps": 30})

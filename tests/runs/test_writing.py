@@ -7,8 +7,8 @@ from omegaconf import OmegaConf
 from run_configs import compose_config
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from safe_rl.runs.figures import final_figures
 from safe_rl.runs.run import Run
+from safe_rl.runs.table import final_figures
 from safe_rl.runs.writing import RunWriter
 
 NAN = math.nan

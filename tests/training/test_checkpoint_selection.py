@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from safe_rl.runs.figures import keeps
+from safe_rl.runs.table import keeps
 from safe_rl.training.checkpoint_selection import CheckpointSelection
 
 EPISODE = 1000
