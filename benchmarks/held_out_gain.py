@@ -54,7 +54,7 @@ def restored(run: Path, directory: Path):
 
 def collect(trainer, number: int) -> list:
     """Batches of the present policy, with penalised costs if a risk measure is limited."""
-    batches, found = trainer.batches(), []
+    batches, found = iter(trainer.collector), []
     for _ in range(number):
         batch = next(batches).clone()
         trainer.algorithm.constraints.update(batch, trainer.accounting.update(batch))

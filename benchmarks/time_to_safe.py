@@ -55,7 +55,7 @@ def time_to_safe(config, options, directory):
     trainer = build_trainer(config, env, directory)
     limits = {key: float(limit) for key, limit in config.cost_limits.items()}
     claim = Claim(limits, highest={key: env.highest_cost(key) for key in limits})
-    batches, rows, tests = trainer.batches(), [], 0
+    batches, rows, tests = iter(trainer.collector), [], 0
     start = time.perf_counter()
     while trainer.progress.steps < config.frames and tests < options.tests:
         rows.append(trainer.epoch(batches))

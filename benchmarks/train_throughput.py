@@ -55,7 +55,7 @@ def measure(config, epochs, directory):
     """Rows of one epoch each, the first left out, and the environment's seconds beside them."""
     seed_everything(config.seed, config.num_threads)
     trainer = build_trainer(config, new_env(config), directory)
-    batches = trainer.batches()
+    batches = iter(trainer.collector)
     env = new_env(config)
     num_steps = config.frames_per_batch // (config.num_envs * env.steps_per_decision)
     rows = []

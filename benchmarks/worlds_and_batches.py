@@ -40,7 +40,7 @@ def steps_per_second(overrides, epochs):
     seed_everything(config.seed, config.num_threads)
     with tempfile.TemporaryDirectory() as directory:
         trainer = build_trainer(config, new_env(config), Path(directory))
-        batches = trainer.batches()
+        batches = iter(trainer.collector)
         rows = [trainer.epoch(batches) for _ in range(epochs + 1)][1:]
     seconds = statistics.median(row["time_collect"] + row["time_learn"] for row in rows)
     return config.frames_per_batch / seconds

@@ -53,7 +53,7 @@ def evaluate_varied(
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:
     """Certify a run; refuse options that would have no effect on its certificate."""
-    from safe_rl.training.finish import certify_run
+    from safe_rl.evaluation.certifying import certify_run
 
     names = ("certify", "certificate", "deterministic", "num_threads")
     read = {name: getattr(options, name) for name in names}

@@ -31,6 +31,7 @@ from safe_rl.cli.config import check_settings
 from safe_rl.cli.evaluate import evaluate_varied
 from safe_rl.cli.options import make_options
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading, measuring
+from safe_rl.evaluation.certifying import certify_run
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
 from safe_rl.evaluation.variations import Varied
@@ -42,7 +43,6 @@ from safe_rl.runs.folder import new_folder
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
-from safe_rl.training.finish import certify_run
 from safe_rl.training.train import Callback
 from safe_rl.trust import check_imports, import_modules
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,10 +22,16 @@ from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.measuring import PolicyEvaluation
-from safe_rl.evaluation.settings import CertificateOptions, EvaluationOptions, is_device
+from safe_rl.evaluation.policies import writable_copy
+from safe_rl.evaluation.settings import (
+    CertificateOptions,
+    EvaluationOptions,
+    certificate_options,
+    is_device,
+)
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
-from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.folder import checkpoint_steps, lock_folder
 from safe_rl.runs.run import Run
 from safe_rl.scores.certificate import Claim, error_of_next_test, first_certified, rank
 
@@ -38,6 +44,35 @@ _OF_EXPORTED = 50_000_000_021  # of an exported policy, which the tests of its r
 # of two batches, which have new instances of the environment; of two tests of a run
 _NEXT_BATCH, _NEXT_TEST = 1_000_003, 1_000_000_000_039
 _ROUNDS = (0.25, 0.25, 0.5)  # shares of the ranking's episodes in its rounds
+
+
+def certify_run(
+    directory: Path | str,
+    *,
+    num_threads: int = 0,
+    changes: Mapping[str, Any] | None = None,
+    deterministic: bool = False,
+) -> Certificate | None:
+    """Certify the best checkpoint of a run that keeps its limits; no other process may write it.
+
+    Args:
+        directory: Folder of the run; a policy of the package is copied into the working directory.
+        num_threads: Threads that step environments; 0 is one per core.
+        changes: Keys of the section ``certificate`` to change.
+        deterministic: Whether the policy acts with its mean actions.
+
+    Returns:
+        The certificate; None if the run has no limits or no checkpoints.
+
+    Raises:
+        RunInUseError: If another process writes into the folder.
+        ValueError: If there is no such key, or it cannot have the value.
+    """
+    run = Run(writable_copy(Path(directory)))
+    asked = {**(changes or {}), **({"deterministic": True} if deterministic else {})}
+    options = certificate_options(run.config, asked)
+    with lock_folder(run.lock_file):  # an unwritable folder is found before hours of tests
+        return certify(run.directory, options, num_threads=num_threads, progress=True)
 
 
 def certify(

@@ -131,19 +131,13 @@ def build_trainer(
 def _build_collector(
     config: DictConfig, env: EnvBase, make_env: MakeEnv | None, algorithm: Algorithm
 ) -> Collector | WorkerCollector:
-    policy = algorithm.policy
-    _check_memory(config, env)
-    numbers = {"frames_per_batch": _decisions_per_batch(config, env), "device": config.device}
-    if config.collector.get("_target_") is None:
-        return make_collector(env, policy, **numbers)
-    return instantiate(config.collector, env=env, make_env=make_env, policy=policy, **numbers)
-
-
-def _check_memory(config: DictConfig, env: EnvBase) -> None:
-    """Refuse batches that are larger than the memory: the system would kill the process."""
+    num_envs, held = env.batch_size.numel(), env.steps_per_decision
+    check_batch(config.frames_per_batch, num_envs, held)
+    decisions = config.frames_per_batch // held
+    # with batches larger than the memory, the system would kill the process
     entries = env.fake_tensordict().values(True, True)
-    step = sum(entry.numel() * entry.element_size() for entry in entries) / env.batch_size.numel()
-    needed = step * _decisions_per_batch(config, env) / 1e9
+    step = sum(entry.numel() * entry.element_size() for entry in entries) / num_envs
+    needed = step * decisions / 1e9
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     if torch.device(config.device).type == "cuda":
         total = torch.cuda.mem_get_info(config.device)[1] / 1e9
@@ -152,12 +146,10 @@ def _check_memory(config: DictConfig, env: EnvBase) -> None:
             f"frames_per_batch={config.frames_per_batch}: a batch takes {needed:,.0f} GB, and "
             f"there are {total:,.0f} GB."
         )
-
-
-def _decisions_per_batch(config: DictConfig, env: EnvBase) -> int:
-    """Decisions of all environments together in a batch; ``frames_per_batch`` counts steps."""
-    check_batch(config.frames_per_batch, env.batch_size.numel(), env.steps_per_decision)
-    return config.frames_per_batch // env.steps_per_decision
+    given = {"policy": algorithm.policy, "frames_per_batch": decisions, "device": config.device}
+    if config.collector.get("_target_") is None:
+        return make_collector(env, **given)
+    return instantiate(config.collector, env=env, make_env=make_env, **given)
 
 
 def begin_from(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
@@ -77,11 +77,6 @@ class CheckpointSelection(Resumable):
                     "a waiting policy must have whole 'steps' and 'epoch', and 'states'."
                 )
 
-    def continue_after(self, rows: Iterable[Mapping[str, float]]) -> None:
-        """Add the epochs of a run that is resumed."""
-        for row in rows:
-            self._take(row)
-
     def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
         """Add an epoch, and score the waiting policy whose epochs are complete.
 
@@ -92,7 +87,7 @@ class CheckpointSelection(Resumable):
             Keyword arguments of `CheckpointStore.save_best` for the policy, if it kept every limit.
             If episodes have become shorter, several are due, and only the latest is scored.
         """
-        self._take(row)
+        self.take(row)
         states = copy.deepcopy(states_of(self._components))
         self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
         delay = epochs_until_scored(self._over, self._length, self._steps_per_epoch)
@@ -100,7 +95,8 @@ class CheckpointSelection(Resumable):
         passed = [self.waiting.pop(0) for _ in range(due)]
         return self._score(passed[-1]) if passed else []
 
-    def _take(self, row: Mapping[str, float]) -> None:
+    def take(self, row: Mapping[str, float]) -> None:
+        """Add an epoch of a run that is resumed, from which no policy waits."""
         self._latest.append(row)
         length = row.get("episode_length", math.nan)
         self._length = length if math.isfinite(length) else self._length

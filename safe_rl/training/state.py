@@ -6,8 +6,9 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
@@ -21,27 +22,20 @@ from torchrl.envs import EnvBase
 from safe_rl.resumable import Resumable
 
 
+@dataclass
 class Progress(Resumable):
     """Counters of a run: epochs, environment steps, seconds of training."""
 
     state_names = ("epoch", "steps", "seconds")
-
-    def __init__(self) -> None:
-        self.epoch = 0
-        self.steps = 0
-        self.seconds = 0.0
+    epoch: int = 0
+    steps: int = 0
+    seconds: float = 0.0
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore the counters; ValueError unless they are numbers from 0 on."""
         super().load_state_dict(state_dict)
         if not all(0 <= n < math.inf for n in (self.epoch, self.steps, self.seconds)):
             raise ValueError("its counters must be finite and not below 0.")
-
-    def add(self, steps: int, seconds: float) -> None:
-        """Count one epoch."""
-        self.epoch += 1
-        self.steps += steps
-        self.seconds += seconds
 
 
 class RandomGenerators(GlobalRNGState):
@@ -122,39 +116,35 @@ class EnvSnapshot:
         self._collector._carrier.update(self._env.set_state(snapshot))
 
 
-class StopRequest:
-    """Remembers the first SIGINT (Ctrl-C), SIGTERM or SIGHUP; a second one acts as usual.
+@contextmanager
+def catching_signals() -> Iterator[list[signal.Signals]]:
+    """Yield a list that gets the first SIGINT (Ctrl-C), SIGTERM or SIGHUP; a second acts as usual.
 
     SIGHUP is sent when a terminal is closed; if it is already ignored, as with ``nohup``, it stays
-    ignored. Signals can only be caught in the main thread; in other threads this class does
-    nothing.
+    ignored. Signals can only be caught in the main thread; in others the list stays empty.
     """
+    received: list[signal.Signals] = []
+    previous: dict[int, signal._HANDLER] = {}
 
-    _SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+    def restore() -> None:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+        previous.clear()
 
-    def __init__(self) -> None:
-        self.received: signal.Signals | None = None
-        self._previous: dict[int, signal._HANDLER] = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            # SIGINT is caught even if ignored, as in a shell's background job: kill -INT must work
-            ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-            caught = self._SIGNALS - {signal.SIGHUP} if ignores_hangup else self._SIGNALS
-            self._previous = {number: signal.signal(number, self._stop) for number in caught}
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._restore()
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        self.received = signal.Signals(number)
-        self._restore()
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(signal.Signals(number))
+        restore()
         # not print(): the signal may have interrupted one; the terminal may be closed
         with suppress(OSError):
             os.write(2, b"\nStopping after this epoch. Once more stops at once.\n")
 
-    def _restore(self) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        self._previous = {}
+    if threading.current_thread() is threading.main_thread():
+        # SIGINT is caught even if ignored, as in a shell's background job: kill -INT must work
+        ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        hangup = set() if ignores_hangup else {signal.SIGHUP}
+        for number in {signal.SIGINT, signal.SIGTERM} | hangup:
+            previous[number] = signal.signal(number, stop)
+    try:
+        yield received
+    finally:
+        restore()

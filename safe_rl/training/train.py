@@ -1,4 +1,4 @@
-"""Train a run in its folder, or continue it."""
+"""Train a run in its folder, or continue it; at the end, certify it if it keeps limits."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import math
 import os
 import re
 import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from shlex import quote
+from signal import SIGINT, Signals
 from typing import Any
 
 import torch
@@ -21,15 +23,17 @@ from torchrl.checkpoint import CheckpointError
 from safe_rl.checks import UNEXPECTED, SettingError
 from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
+from safe_rl.evaluation.certificate import has_options
+from safe_rl.evaluation.certifying import certify_run
 from safe_rl.evaluation.loading import keep_robot, node_of
+from safe_rl.evaluation.settings import certificate_options
 from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.folder import RunInUseError, lock_folder
+from safe_rl.runs.folder import RunInUseError, checkpoint_steps, lock_folder
 from safe_rl.runs.identity import is_to_keep_limits
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableError
 from safe_rl.training.building import begin_from, build_run, seed_everything
-from safe_rl.training.finish import certify_finished, end_by, import_words, print_line
 from safe_rl.training.trainer import Trainer
 
 Callback = Callable[[Mapping[str, float]], Any]
@@ -98,8 +102,13 @@ def train(
             trainer = _prepare(config, run, continues, callbacks, say)
             if hydra is not None and not (continues and run.notes_folder.exists()):
                 _write_notes(run, config, hydra)
-            with _during_training():
+            try:
                 say(trainer.run())
+            except Exception as error:
+                # users see the traceback of an error that no setting explains
+                if not isinstance(error, _WHILE_TRAINING):
+                    error.add_note(UNEXPECTED)
+                raise
             stopped_by, length = trainer.stopped_by, trainer.env.max_episode_steps
             if not trainer.is_finished:
                 end_by(stopped_by, f"Interrupted. Continue with: {again}")
@@ -153,17 +162,6 @@ def _named_memory(config: DictConfig) -> Iterator[None]:
             f"There is not enough memory with frames_per_batch={config.frames_per_batch}, "
             f"num_envs={config.num_envs} and these networks: lower them."
         ) from error
-
-
-@contextmanager
-def _during_training() -> Iterator[None]:
-    """Mark errors that no setting explains: users see their traceback."""
-    try:
-        yield
-    except Exception as error:
-        if not isinstance(error, _WHILE_TRAINING):
-            error.add_note(UNEXPECTED)
-        raise
 
 
 def _check_is_free(run: Run, again: str, key: str) -> None:
@@ -240,3 +238,83 @@ def _write_notes(run: Run, config: DictConfig, hydra: Any) -> None:
     for path, content in notes:
         with replacing(path) as unfinished:
             OmegaConf.save(content, unfinished)
+
+
+def certify_finished(
+    run: Run,
+    config: DictConfig,
+    length: int,
+    *,
+    stopped_by: Signals | None,
+    again: str,
+    say: Callable[[str], None],
+) -> None:
+    """Certify a finished run that is to keep limits, unless it is short or tested already.
+
+    A tested one is tested again if the configuration has other options for the test.
+
+    Args:
+        run: The run.
+        config: Its configuration.
+        length: T_ep, steps of a full episode.
+        stopped_by: The signal that has come in the last epoch: it ends the process before the test.
+        again: The command that continues the run.
+        say: Prints a line.
+
+    Raises:
+        SystemExit: If a signal has come, or comes during the test.
+    """
+    # steps of a test that stops early, after a fifth of its episodes
+    steps = int(config.certificate.episodes * length / 5)
+    newest, certificate = run.newest_checkpoint(), run.certificate or {}
+    tested = certificate.get("candidates") or ()
+    is_tested = newest is not None and checkpoint_steps(newest) in tested
+    # a certificate with the options of `safe-rl evaluate` stays if the run's own are unchanged
+    is_unchanged = config.certificate == run.config.certificate
+    has_same_options = is_unchanged or has_options(certificate, certificate_options(config))
+    if not steps or (is_tested and has_same_options):
+        return
+    if steps > config.frames:
+        given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
+        say(
+            f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "
+            f"steps of certificate.episodes={config.certificate.episodes} episodes. To make a "
+            "certificate all the same: safe-rl evaluate "
+            f"{quote(str(run.directory))} certify=true{given}{import_words(config)}"
+        )
+        return
+    later = f"Interrupted before it was certified. To do so: {again}"
+    end_by(stopped_by, later)
+    threads, changes = config.num_threads or 0, config.certificate
+    try:
+        result = certify_run(run.directory, num_threads=threads, changes=changes)
+    except KeyboardInterrupt:
+        return end_by(SIGINT, later)
+    say(str(result))
+    if result is not None and result.checkpoint is None:
+        say(f"To train on: {again} frames={2 * config.frames:_}")
+
+
+def import_words(config: DictConfig) -> str:
+    """The words ``import=…`` of a run's modules, each after a space."""
+    return "".join(f" import={quote(name)}" for name in config.get("import") or [])
+
+
+def end_by(signal: Signals | None, line: str) -> None:
+    """End the process if a signal asks for it, with a line about how to go on.
+
+    Raises:
+        SystemExit: If there is a signal; the status is 128 and its number.
+    """
+    if signal is not None:
+        print_line(line)
+        raise SystemExit(128 + signal)
+
+
+def print_line(line: str) -> None:
+    """Print a line, unless the terminal was closed; that may have ended the run."""
+    try:
+        print(line, flush=True)
+    except OSError:
+        # Python would flush the buffered line again at exit, and change the exit status
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115

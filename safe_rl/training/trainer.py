@@ -24,7 +24,7 @@ from safe_rl.training.state import (
     EnvSnapshot,
     Progress,
     RandomGenerators,
-    StopRequest,
+    catching_signals,
     staggered_steps,
 )
 
@@ -52,6 +52,8 @@ class Trainer:
 
     Attributes:
         components: The parts of a checkpoint by name.
+        snapshot: The state of the environments, which checkpoints have; None if a resumed run
+            begins new episodes.
         stopped_by: The signal that has ended the run, if any.
         callbacks: Called after every epoch with its row; one that returns False ends the run.
     """
@@ -80,15 +82,15 @@ class Trainer:
         self.progress, self.writer, self.env = Progress(), writer, env
         self.stopped_by: Signals | None = None
         self.callbacks: Sequence[Callable[[Mapping[str, float]], Any]] = ()
-        self._collector, self._is_continued = collector, False
+        self.collector, self._is_continued = collector, False
         self._evaluation, self._recording = evaluation, recording
         # the environments of workers are in other processes
-        self._snapshot = None
+        self.snapshot = None
         if isinstance(collector, Collector) and env.get_state() is not None:
-            self._snapshot = EnvSnapshot(env, collector)
+            self.snapshot = EnvSnapshot(env, collector)
         self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
         if self._first_steps is not None:
-            (self._snapshot or collector).stagger(self._first_steps)
+            (self.snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._checkpoint_interval = config.frames, config.checkpoint.interval
         self._open_checkpoints(config, cost_limits)
@@ -101,8 +103,8 @@ class Trainer:
             "progress": self.progress,
             "rng": RandomGenerators(),
         }
-        if self._snapshot is not None:
-            parts["env"] = self._snapshot
+        if self.snapshot is not None:
+            parts["env"] = self.snapshot
         self._selection = CheckpointSelection(
             {name: part for name, part in parts.items() if name not in _FOR_RESUMING},
             cost_limits,
@@ -131,15 +133,11 @@ class Trainer:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
         """
         self._is_continued = True
-        restored = self._checkpoints.resume(self.writer.run.num_rows)
-        if restored is not None:  # a run that starts over has begun its episodes already
+        restored = self._checkpoints.resume(self.writer.run.num_rows) is not None
+        # a run that starts over has begun its episodes already
+        if restored and self.snapshot is None:
             self._begin_episodes()
-        return restored is not None
-
-    @property
-    def begins_anew(self) -> bool:
-        """Whether a resumed run begins new episodes, because checkpoints have no environments."""
-        return self._snapshot is None
+        return restored
 
     @property
     def is_finished(self) -> bool:
@@ -147,9 +145,7 @@ class Trainer:
         return self.stopped_by is None or self.progress.steps >= self._frames
 
     def _begin_episodes(self) -> None:
-        """Begin new episodes if the state of the environments was not saved."""
-        if self._snapshot is not None:
-            return
+        """Begin new episodes: the state of the environments was not saved."""
         if self._first_steps is None:
             self.accounting.forget_open_episodes()
         else:
@@ -161,8 +157,8 @@ class Trainer:
         # with the old seed the first episodes of the run would be repeated; workers start later,
         # from the state of this environment
         self.env.set_seed(int(torch.randint(2**31, ())))
-        if isinstance(self._collector, Collector):
-            self._collector.reset()
+        if isinstance(self.collector, Collector):
+            self.collector.reset()
 
     def run(self) -> str:
         """Train for ``frames`` steps, rounded up to whole batches.
@@ -178,32 +174,34 @@ class Trainer:
         except BaseException:
             self.close()
             raise
-        if isinstance(self._collector, WorkerCollector):
-            self._collector.shutdown()
+        if isinstance(self.collector, WorkerCollector):
+            self.collector.shutdown()
         return self.writer.summary()
 
     def close(self) -> None:
         """Close the collector with its workers, if any, and the environment."""
-        if isinstance(self._collector, WorkerCollector):
-            self._collector.kill()
+        if isinstance(self.collector, WorkerCollector):
+            self.collector.kill()
         else:
-            self._collector.shutdown()
+            self.collector.shutdown()
         if not self.env.is_closed:
             self.env.close()
 
     def _train(self) -> None:
-        batches = self.batches()
+        batches = iter(self.collector)
         saved_at = time.monotonic()
         epoch = self.progress.epoch if self._is_continued else None
-        with StopRequest() as stop, self.writer.writing(epoch, self.progress.steps):
-            if not self.progress.epoch:
-                self._checkpoints.begin()
+        with catching_signals() as signals, self.writer.writing(epoch, self.progress.steps):
             if self._recording is not None:
                 # batches after the checkpoint are removed, as rows of the table are
                 self._recording.begin(self.progress.epoch)
-            self._selection.continue_after(self.writer.rows())
-            # if the run was shorter before, these were scored by fewer epochs at its end
-            self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
+            if not self.progress.epoch:
+                self._checkpoints.begin()
+            else:
+                for row in self.writer.rows():
+                    self._selection.take(row)
+                # if the run was shorter before, these were scored by fewer epochs at its end
+                self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
             while self.progress.steps < self._frames:
                 row = self.epoch(batches)
                 self.writer.add(row)
@@ -213,31 +211,31 @@ class Trainer:
                 # also the False of NumPy
                 if any(isinstance(answer, bool | np.bool_) and not answer for answer in answers):
                     break
-                if stop.received:  # checked after an epoch: every run has at least one
+                if signals:  # checked after an epoch: every run has at least one
                     break
                 if time.monotonic() - saved_at > self._checkpoint_interval:
                     self._save()
                     saved_at = time.monotonic()
-            self.stopped_by = stop.received
+            self.stopped_by = signals[0] if signals else None
             if self.is_finished:
                 # before the last checkpoint is written, which marks the run as finished
                 for policy in self._selection.score_all():
                     self._checkpoints.save_best(**policy)
             self._save()
 
-    def batches(self) -> Iterator[TensorDictBase]:
-        """Endless rollouts [N, T] of the current policy."""
-        return iter(self._collector)
-
     def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
-        """Collect one batch and learn from it; return the row of the table."""
+        """Collect a batch [N, T] and learn from it; return the row of the table.
+
+        Args:
+            batches: The endless batches of ``collector``.
+        """
         start = time.perf_counter()
         # One observation per environment is too little work for several threads, and the physics
         # needs the cores.
         with torch_threads(1):
             batch = next(batches)
-            if self._snapshot is not None:
-                self._snapshot.take()
+            if self.snapshot is not None:
+                self.snapshot.take()
         collected, begun = time.perf_counter(), self.accounting.have_begun
         episodes = self.accounting.update(batch)
         if self._recording is not None:
@@ -246,7 +244,9 @@ class Trainer:
             learned = self.algorithm.learn(batch, episodes)
         end = time.perf_counter()
         before = self.progress.steps
-        self.progress.add(episodes.steps, end - start)
+        self.progress.epoch += 1
+        self.progress.steps += episodes.steps
+        self.progress.seconds += end - start
         evaluated: dict[str, float] = {}
         if self._evaluation is not None:
             with torch_threads(1):

@@ -63,7 +63,7 @@ def test_a_run_learns_with_a_loss_of_torchrls(name, tmp_path, monkeypatch):
         point_mass_trainer(tmp_path / "kl", *keys).run()
     free = ("policy_update.max_kl=null", "policy_update.adapt_rate=null")
     trainer = point_mass_trainer(tmp_path, *keys, *free)
-    row = trainer.epoch(trainer.batches())
+    row = trainer.epoch(iter(trainer.collector))
     assert math.isfinite(row["policy_loss_critic"])
     assert ("policy_explained_variance" in row) == (name != "A2CLoss")
 

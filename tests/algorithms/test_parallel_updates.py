@@ -90,7 +90,7 @@ def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_pat
         on_policy, "in_parallel", lambda *both: calls.append(both) or [call() for call in both]
     )
     trainer = point_mass_trainer(tmp_path, "algo=ppo", f"loss._target_={loss}")
-    row = trainer.epoch(trainer.batches())
+    row = trainer.epoch(iter(trainer.collector))
     assert len(calls) == number
     assert row["policy_num_steps"] > 0
     assert row["critic_num_steps"] == 12
@@ -106,7 +106,7 @@ def test_an_actor_that_shares_layers_with_the_critic_is_moved_before_its_fit(tmp
     algorithm = trainer.algorithm
     loss = algorithm.policy_update.loss
     algorithm.policy_update.loss = lambda batch: loss(batch)
-    batches = trainer.batches()
+    batches = iter(trainer.collector)
     trainer.epoch(batches)
     assert len(calls) == 1
     algorithm.actor.add_module("trunk", algorithm.critic.module)

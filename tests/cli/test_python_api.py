@@ -233,7 +233,7 @@ def test_a_policy_of_the_package_is_certified_as_a_copy(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     places = []
     monkeypatch.setattr(
-        "safe_rl.training.finish.certify", lambda place, *_, **__: places.append(place)
+        "safe_rl.evaluation.certifying.certify", lambda place, *_, **__: places.append(place)
     )
     safe_rl.load("certified/PointGoal1").certify(episodes=4)
     assert places == [Path("certified/PointGoal1")]
@@ -242,7 +242,7 @@ def test_a_policy_of_the_package_is_certified_as_a_copy(tmp_path, monkeypatch):
 def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch):
     given = []
     monkeypatch.setattr(
-        "safe_rl.training.finish.certify_run",
+        "safe_rl.training.train.certify_run",
         lambda *said, **options: given.append((*said, options)),
     )
     run.certificate_file.unlink()

@@ -101,7 +101,7 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("safe_rl.training.finish.certify", interrupt)
+        patch.setattr("safe_rl.evaluation.certifying.certify", interrupt)
         status, out, _ = command(
             *(*SMALL, "frames=40", "certificate.episodes=2", "certificate.ranking=2"),
             "hydra.run.dir=runs/mine",

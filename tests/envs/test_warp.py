@@ -190,7 +190,7 @@ def looks_of_an_epoch(directory, num_steps, algo):
     env = make_env(OmegaConf.to_container(config.env, resolve=True), num_envs=4, num_threads=1)
     env._physics.waits, env._physics._late.look = True, lambda: None
     trainer = build_trainer(config, env, directory)
-    batches = trainer.batches()
+    batches = iter(trainer.collector)
     trainer.epoch(batches)
     with CountLooks() as mode:
         trainer.epoch(batches)

@@ -123,7 +123,7 @@ def test_a_run_without_a_checkpoint_starts_over(kind, tmp_path, monkeypatch):
     begun = point_mass_trainer(tmp_path / "begun", "frames=480")
     with begun.writer.writing():
         begun._checkpoints.begin()
-        begun.writer.add(begun.epoch(begun.batches()))
+        begun.writer.add(begun.epoch(iter(begun.collector)))
     again = point_mass_trainer(tmp_path / "begun", "frames=480")
     assert again.writer.run.has_begun
     again.resume()

@@ -128,6 +128,6 @@ def test_of_short_episodes_nobody_waits_as_if_they_were_long():
     # the batch after their update, once it is known that episodes are short
     assert evaluated == [[], [], [], [(3, 4)], [(4, 5)], [(5, 6)]]
     again = CheckpointSelection({}, {}, **options)
-    again.continue_after([{"episode_length": 50.0}])
+    again.take({"episode_length": 50.0})
     row = {"epoch": 7, "steps": 7, "episode_return": 7.0}
     assert [again.add(row), [one["steps"] for one in again.add(row | {"steps": 8})]] == [[], [7]]

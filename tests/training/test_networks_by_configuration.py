@@ -60,7 +60,7 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
 
     trainer = build_trainer(config, make(num_envs=4), tmp_path, make)
     try:
-        batches = trainer.batches()
+        batches = iter(trainer.collector)
         for _ in range(2):
             trainer.epoch(batches)
         batch = next(batches)

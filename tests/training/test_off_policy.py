@@ -111,7 +111,7 @@ def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
 
 def test_a_delayed_policy_moves_every_other_step(make_trainer):
     trainer = make_trainer("run", "algo=td3", "policy_update.policy_delay=10000")
-    batches = trainer.batches()
+    batches = iter(trainer.collector)
     before = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
     trainer.epoch(batches)
     first = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
@@ -145,7 +145,7 @@ def test_sums_over_steps_end_where_a_resumed_run_begins_new_episodes(tmp_path):
     build().run()
     resumed = build()
     assert resumed.resume()
-    resumed.epoch(resumed.batches())
+    resumed.epoch(iter(resumed.collector))
     # the last three of the first 40 steps in a row end there, the last three of all are kept back
     assert len(resumed.algorithm.replay_buffer) == 4 * (40 + 37)
     spanned = resumed.algorithm.replay_buffer.state_dict()["steps"]["steps_to_next_obs"].flatten()
@@ -264,7 +264,7 @@ def test_without_limits_no_critics_of_costs_are_needed():
 def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_trainer):
     config = ["algo=wcsac", "frames=8000", "frames_per_batch=1600", "exploration.random_steps=8000"]
     trainer = make_trainer("run", *config, "risk.tail=0.25")
-    costs, rows, batches = [], [], trainer.batches()
+    costs, rows, batches = [], [], iter(trainer.collector)
     update = trainer.accounting.update
     trainer.accounting.update = lambda batch: (costs.append(found := update(batch)), found)[1]
     for _ in range(5):

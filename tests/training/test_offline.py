@@ -179,7 +179,7 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     trainer = make_trainer(offline_config(data, *keys, algo="sac"), tmp_path / "run")
     assert len(trainer.algorithm.replay_buffer) == 320
     before = len(trainer.algorithm.replay_buffer)
-    trainer.epoch(trainer.batches())
+    trainer.epoch(iter(trainer.collector))
     # the last three of each row wait for what follows them
     assert len(trainer.algorithm.replay_buffer) == before + 4 * 37
     assert "dataset alone" in trainer.algorithm.lost_on_resume
@@ -188,7 +188,7 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     alone = make_trainer(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "alone")
     assert not alone.algorithm.policy.is_random
     assert alone.algorithm.lost_on_resume == ""
-    assert alone.epoch(alone.batches())["policy_num_updates"] == 8
+    assert alone.epoch(iter(alone.collector))["policy_num_updates"] == 8
     assert not alone.algorithm.policy.is_random
     assert len(alone.algorithm.replay_buffer) == before
     keys += ["memory.prioritised={alpha: 0.6, beta: 0.4}"]

@@ -54,13 +54,13 @@ def test_all_networks_are_taken_over_and_nothing_else(trained):
         assert same(fresh.algorithm.networks[name], theirs)
     assert fresh.progress.steps == 0
     assert not fresh.algorithm.policy_update.optimizer.state
-    first = fresh.epoch(fresh.batches())
+    first = fresh.epoch(iter(fresh.collector))
     assert first["epoch"] == 1
 
 
 def test_the_policy_that_collects_has_the_weights(trained):
     fresh, _ = take_over(trained)
-    batch = next(fresh.batches())
+    batch = next(iter(fresh.collector))
     expected = trained.algorithm.actor.get_dist(batch)
     assert torch.allclose(batch["loc"], expected.base_dist.loc, atol=1e-6)
 

@@ -63,7 +63,7 @@ def test_everything_counts_steps_of_the_environment_where_actions_are_held(tmp_p
     trainer = make_trainer(tmp_path, *options, minibatch_size=None)
     starts = trainer.env.get_state()["step_count"][:, 0].tolist()
     assert starts == [0, 4, 8, 12]  # of 20 steps: 0, 5, 10, 15 rounded down to decisions
-    batch = next(trainer.batches())
+    batch = next(iter(trainer.collector))
     assert batch.shape == (4, 10)
     trainer = make_trainer(tmp_path / "run", *options, minibatch_size=None)
     trainer.run()
@@ -98,11 +98,11 @@ def test_where_worlds_cannot_be_stored_schedules_go_on_in_other_episodes(tmp_pat
     monkeypatch.setattr(f"{__name__}.PointMass", Forgetful)
     options = ["algo=ppo", "transforms=[simmer]", "transforms.simmer.steps=80"]
     begun = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=160")
-    seen = next(begun.batches())["observation"]
+    seen = next(iter(begun.collector))["observation"]
     begun.run()
     resumed = make_trainer(tmp_path, *options, "transforms.simmer.first=0.25", "frames=320")
     assert resumed.resume()
-    start = next(resumed.batches())["observation"][:, :1]
+    start = next(iter(resumed.collector))["observation"][:, :1]
     # after 40 of 80 steps
     assert seen[:, 0, -1].tolist() == [0.25] * 4
     assert start[:, 0, -1].tolist() == [0.625] * 4
@@ -114,7 +114,7 @@ def test_what_transforms_of_torchrl_remember_goes_on_from_batch_to_batch(tmp_pat
     changes = {"count": StepCounter(max_steps=15)}
     env = transform_env(PointMass(config.num_envs), changes, evaluating=False)
     trainer = build_trainer(config, env, tmp_path)
-    batches = trainer.batches()
+    batches = iter(trainer.collector)
     rows = [trainer.epoch(batches) for _ in range(4)]
     assert [row["episodes"] for row in rows] == [0, 4, 4, 0]
     assert rows[1]["episode_length"] == rows[2]["episode_length"] == 15
@@ -123,7 +123,7 @@ def test_what_transforms_of_torchrl_remember_goes_on_from_batch_to_batch(tmp_pat
 def test_returns_are_those_of_the_own_reward(tmp_path, monkeypatch):
     monkeypatch.setattr("point_mass.HAZARD_RADIUS", 0.7)
     trainer = make_trainer(tmp_path, *SAUTE)
-    batch = next(trainer.batches())
+    batch = next(iter(trainer.collector))
     shaped, own = batch["next", "reward"], batch["next", "task_reward"]
     assert not torch.equal(shaped, own)
     episodes = trainer.accounting.update(batch)
