@@ -36,12 +36,7 @@ def is_number(value: Any) -> bool:
 
 
 def rule(holds: Callable[[Any], bool], words: str) -> AfterValidator:
-    """Metadata of `Annotated`: values for which a function is true.
-
-    Args:
-        holds: The function.
-        words: What such values are, to follow "it must be".
-    """
+    """Metadata of `Annotated`: values for which `holds` is true; `words` follow "it must be"."""
 
     def validate(value: Any) -> Any:
         if not holds(value):
@@ -58,6 +53,23 @@ Weight = Annotated[float, Interval(ge=0, lt=1)]
 """A share below 1, such as the weight of the past in a moving average."""
 Text = Annotated[
     str, rule(lambda text: bool(text.strip()) and text.isprintable(), "a text of one line")
+]
+
+
+def is_device(value: Any) -> bool:
+    """Whether torch finds this device here."""
+    import torch  # here, because help and configurations are shown without it
+
+    try:
+        device = torch.device(value)
+    except (RuntimeError, TypeError):
+        return False
+    here = {"cpu": 1, "cuda": torch.cuda.device_count()}
+    return (device.index or 0) < here.get(device.type, 0)
+
+
+Device = Annotated[
+    str, rule(is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
 ]
 
 

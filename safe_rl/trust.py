@@ -140,7 +140,7 @@ def instantiate(
     """Build what a node's ``_target_`` names, as `hydra.utils.instantiate` does.
 
     Args:
-        node: The node. Nodes within it that have a ``_target_`` are built first. A node with
+        node: The node. Those within it that have a ``_target_`` are built first; one with
             ``_partial_: true`` becomes a function that takes the remaining arguments later.
         optional: Arguments that the outermost target gets if its signature has them and they are
             not None.

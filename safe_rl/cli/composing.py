@@ -96,10 +96,6 @@ def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
 def name_choices(config: DictConfig, hydra: Any) -> None:
     """Give a run the names of what was chosen: whatever was merged into it, the name is true.
 
-    Args:
-        config: The run's configuration.
-        hydra: Hydra's settings of it.
-
     Raises:
         ValueError: If a transform is chosen twice, or a changed environment has the name of another
             one of the package.
@@ -188,9 +184,8 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         return _absent(absent[1])
     if cause is not None and str(error) != str(cause):
         return f"{first_line(error)}: {first_line(cause)}"
-    missing = re.match(r"Missing mandatory value: (\S+)", str(error))
-    if missing:
-        return f"{missing[1]} has to be given: {missing[1]}=…"
+    if absent:
+        return f"{absent[1]} has to be given: {absent[1]}=…"
     return " ".join(str(error).split())
 
 
@@ -266,7 +261,7 @@ def read_resumed(
 
     Args:
         directory: Folder of the run.
-        modules: Modules that the command has imported; None if it names none.
+        modules: Modules of ``import=``; None if the command does not have it.
         words: The other words of the command.
 
     Raises:

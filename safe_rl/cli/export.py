@@ -39,7 +39,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     """Write a policy to a file, or to a folder."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
-    from safe_rl.evaluation.policies import describe, export_onnx, find_run, pack_policy
+    from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
 
     import_modules(modules)
     run, target = Run(find_run(words[0])), Path(words[1])
@@ -51,9 +51,8 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         check_imports(run.config, modules, run.directory)
         checkpoint = run.find_checkpoint(which)
         sampled = _choose_actions(run, checkpoint, options.actions)
-        about = describe(run.directory, checkpoint, sampled=sampled)
         with closing(run.make_env()) as env:
-            export_onnx(run.config, env, checkpoint, target, sampled=sampled, about=about)
+            export_onnx(run, env, checkpoint, target, sampled=sampled)
     else:
         target = pack_policy(run.directory, target, which)
     print(f"wrote {target}")

@@ -40,13 +40,8 @@ _failed: set[str] = set()  # folders of the jobs of this process that have faile
 def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> float:
     """Begin or continue the run of one job; a failure is written into its folder.
 
-    Args:
-        config: The job's configuration.
-        settings: Hydra's settings of the job.
-        directory: The job's folder.
-
     Returns:
-        The value that an optimising sweeper maximises; −∞ if the job fails.
+        The value of `run_job`, which an optimising sweeper maximises; −∞ if the job fails.
     """
     run = Run(directory)
     _failed.discard(str(directory))

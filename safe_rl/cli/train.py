@@ -45,9 +45,7 @@ from safe_rl.trust import import_modules
 def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
     """Run a function of ``@hydra.main``, with ``import=``, ``slate=`` and ``resume=``.
 
-    Args:
-        main: The function.
-        words: The command's arguments; None: those of the process.
+    The words are the command's arguments; None: those of the process.
 
     Raises:
         SystemExit: With a message of one line, if the words cannot be used.

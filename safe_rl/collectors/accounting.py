@@ -152,14 +152,6 @@ class EpisodeAccounting(Resumable):
         steps_per_decision: Environment steps per time step of a batch. If it is not 1,
             ``steps_taken`` below ``"next"`` has the number of each time step.
 
-    Raises:
-        KeyError: By `update`, if a key is not in the batch.
-        EpisodeError: By `update`, if a cost is below 0, or an episode too long.
-        FloatingPointError: By `update`, if an observation, action, reward or cost is NaN or
-            infinite.
-        ValueError: By `update`, if the batch does not have the shape [N, T], or [T] with
-            N = 1, or an entry is not one number per step.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -211,7 +203,14 @@ class EpisodeAccounting(Resumable):
             raise ValueError("sums of steps and costs must be finite and not below 0.")
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
-        """Add the next batch of consecutive steps, [N, T], or [T] of a single environment."""
+        """Add the next batch of consecutive steps, [N, T], or [T] of a single environment.
+
+        Raises:
+            KeyError: If a key is not in the batch.
+            EpisodeError: If a cost is below 0, or an episode too long.
+            FloatingPointError: If an observation, action, reward or cost is NaN or infinite.
+            ValueError: If the batch has another shape, or an entry is not one number per step.
+        """
         num_envs = self.open_sums.shape[0]
         if batch.ndim == num_envs == 1:
             batch = batch.unsqueeze(0)

@@ -213,12 +213,7 @@ class WorkerCollector:
 
 
 def check_batch(frames_per_batch: int, num_envs: int, steps_at_a_time: int = 1) -> None:
-    """Refuse batches that a number of environments cannot share equally.
-
-    Args:
-        frames_per_batch: Steps of all environments together.
-        num_envs: Number of environments.
-        steps_at_a_time: Environment steps per action.
+    """Refuse batches, in steps of all environments, that these cannot share equally.
 
     Raises:
         ValueError: If the steps are not a positive multiple of those taken together.

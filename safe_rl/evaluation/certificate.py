@@ -73,14 +73,12 @@ class Certificate:
         return "\n".join([head, *rows, self._not_covered_text()])
 
     def _bound_text(self, name: str) -> str:
-        """Text on one bound."""
         bound, limit = self.verdict.bounds[name]
         if name in self.verdict.by_construction:
             return f"{name} ≤ {rounded_up(bound):.3g} by construction, limit {limit:g}"
         return f"{name} ≤ {rounded_up(bound):.3g}, limit {limit:g}"
 
     def _episodes_needed_text(self) -> str:
-        """Text on the number of episodes, if the test had too few to succeed."""
         if self.fewest <= self.options.episodes:
             return ""
         if math.isinf(self.fewest):
@@ -91,7 +89,6 @@ class Certificate:
         )
 
     def _not_covered_text(self) -> str:
-        """Text on what the bounds do not cover."""
         sentences = []
         capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
         for name in capped:

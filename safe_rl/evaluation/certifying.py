@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from safe_rl.checks import is_number
+from safe_rl.checks import is_device, is_number
 from safe_rl.evaluation.certificate import Certificate
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, has_fixed_layout
 from safe_rl.evaluation.loading import maker_of
@@ -27,7 +27,6 @@ from safe_rl.evaluation.settings import (
     CertificateOptions,
     EvaluationOptions,
     certificate_options,
-    is_device,
 )
 from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
@@ -93,8 +92,7 @@ def certify(
     Args:
         directory: Folder of the run.
         options: Options of the test, such as the number of episodes.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments;
-            None: those of the run.
+        make_env: As in `safe_rl.evaluation.evaluate`.
         num_threads: Threads that step environments; 0 is one per core.
         progress: Whether to show a bar.
 

@@ -59,7 +59,7 @@ def collect_episodes(
 
     Args:
         env: Batched environment, batch_size [N].
-        policy: The policy: writes the action into the TensorDict of a state.
+        policy: Writes the action into the TensorDict of a state.
         num_episodes: Number of episodes E. Worlds that have finished their share continue until all
             have, but their further episodes do not count.
         cost_keys: Keys of the costs to sum, below "next".
@@ -196,8 +196,7 @@ def periodic_evaluation(
         cost_keys: Keys of the costs to sum.
         interval: Steps of training from one evaluation to the next.
         episodes: Episodes per evaluation.
-        seed: Seed of the worlds, to which the steps of training are added, and of the policy's
-            actions.
+        seed: Seed of worlds and actions, to which the steps of training are added.
         fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
     """
     names = [f"evaluation_{name}" for name in ("return", *cost_keys)]

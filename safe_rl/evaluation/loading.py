@@ -144,10 +144,7 @@ def load_policy(
 
 
 def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse keys that a custom environment does not have, with a `ValueError`.
-
-    It would ignore such keys, and the results would be taken for those of an environment that was
-    not evaluated.
+    """Refuse keys that a custom environment lacks, with a `ValueError`: it would ignore them.
 
     Examples:
         >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])

@@ -68,7 +68,7 @@ class PolicyEvaluation:
         config: Configuration of the run; its ``env`` is the environment.
         checkpoint: Checkpoint with the policy.
         options: Options of the evaluation.
-        make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments.
+        make_env: As in `evaluate`.
     """
 
     config: DictConfig

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -25,7 +25,7 @@ from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
 from safe_rl.models import BehaviourPolicy, ExploringPolicy
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
-from safe_rl.runs.folder import checkpoint_steps, is_unfinished
+from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, is_unfinished
 from safe_rl.runs.identity import config_dirs, repeating
 from safe_rl.runs.run import Run
 
@@ -80,7 +80,8 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         raise FileExistsError(f"{folder} has other files: give a new folder for the policy.")
     steps = checkpoint_steps(path)
     is_certified = source.certificate_of(path) is not None
-    kept = target.checkpoint_file("certified" if is_certified else "last", steps or 0)
+    kept = target.checkpoints_folder / ("certified" if is_certified else "last")
+    kept /= checkpoint_name(steps or 0)
     overrides, hydra = (
         read_yaml(file) if file.is_file() else None
         for file in (source.overrides_file, source.hydra_file)
@@ -126,28 +127,20 @@ class _Deployed(nn.Module):
 
 
 def export_onnx(
-    config: DictConfig,
-    env: EnvBase,
-    checkpoint: Path,
-    file: Path,
-    *,
-    sampled: bool = False,
-    about: Mapping[str, Any] | None = None,
+    run: Run, env: EnvBase, checkpoint: Path, file: Path, *, sampled: bool = False
 ) -> None:
     """Write a policy as a function from the observation to the action that the environment takes.
 
     The input ``observation`` is float32 [N, D] for any N, before any scaling. The output ``action``
-    [N, A] has the units and bounds of the environment itself, to which actions in [-1, 1] are
-    scaled if the run's environment does so. The file's metadata describe both; their values are
-    JSON.
+    [N, A] has the units and bounds of the environment itself. The file's metadata describe both,
+    and have the certificate if it covers these actions; their values are JSON.
 
     Args:
-        config: Configuration of the run.
-        env: An environment with the observations and actions of the run.
+        run: The run.
+        env: An environment with its observations and actions.
         checkpoint: The policy's weights.
         file: The file to write.
         sampled: Whether the graph samples its actions; else it returns their mean.
-        about: Further entries of the metadata.
 
     Raises:
         ModuleNotFoundError: If the extra ``onnx`` is not installed.
@@ -162,7 +155,7 @@ def export_onnx(
             "Only policies with a vector as observation and bounded numbers as action can be "
             "exported."
         )
-    policy = load_policy(config, env, checkpoint, torch.device("cpu"))
+    policy = load_policy(run.config, env, checkpoint, torch.device("cpu"))
     if len(policy.in_keys) != 1:
         raise ValueError(f"Policies that read {policy.in_keys} cannot be exported, only vectors.")
     if sampled and not isinstance(policy, BehaviourPolicy | ExploringPolicy):
@@ -172,8 +165,7 @@ def export_onnx(
             "cover it."
         )
     bounds = [action.space.low[0], action.space.high[0], *env.action_bounds]
-    about = {**_interface(config, env, bounds[2:]), **(about or {})}
-    about["actions"] = "sampled" if sampled else "mean"
+    about = _about(run, env, checkpoint, sampled=sampled)
     with (
         exploration(deterministic=not sampled),
         torch.no_grad(),
@@ -196,37 +188,26 @@ def export_onnx(
         onnx.save(model, str(unfinished))
 
 
-def _interface(config: DictConfig, env: EnvBase, bounds: Sequence[Tensor]) -> dict[str, Any]:
-    """What a program must know to use a policy: columns, units, the environment of training."""
+def _about(run: Run, env: EnvBase, checkpoint: Path, *, sampled: bool) -> dict[str, Any]:
+    """What a program must know to use a policy: columns, units, where it comes from."""
+    config, certificate = run.config, run.certificate_of(checkpoint)
+    if certificate is not None and is_sampled(certificate) != sampled:
+        certificate = None  # it is about other actions
+    kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
+    low, high = env.action_bounds
     return {
         "observation": env.column_names,
-        "action_low": bounds[0].tolist(),
-        "action_high": bounds[1].tolist(),
+        "action_low": low.tolist(),
+        "action_high": high.tolist(),
         "steps_per_action": env.steps_per_decision,
         "environment": OmegaConf.to_container(config.env, resolve=True),
         "transforms": transforms_of(config),
         "cost_limits": OmegaConf.to_container(config.cost_limits, resolve=True),
-    }
-
-
-def describe(directory: Path, checkpoint: Path, *, sampled: bool) -> dict[str, Any]:
-    """Where a policy comes from, for the metadata of its file; a certificate only if it covers it.
-
-    Args:
-        directory: Folder of the run.
-        checkpoint: The policy's weights.
-        sampled: Whether its actions are sampled when it is used.
-    """
-    run = Run(directory)
-    certificate = run.certificate_of(checkpoint)
-    if certificate is not None and is_sampled(certificate) != sampled:
-        certificate = None
-    kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
-    return {
         "algorithm": run.algorithm,
         "steps": checkpoint_steps(checkpoint),
         "commit": run.code[-1]["commit"] if run.code else None,
         "certificate": certificate and {key: certificate.get(key) for key in kept},
+        "actions": "sampled" if sampled else "mean",
     }
 
 

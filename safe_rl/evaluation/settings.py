@@ -13,6 +13,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.checks import (
     CheckedOptions,
+    Device,
     Fraction,
     SettingError,
     Share,
@@ -27,21 +28,6 @@ PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
 
 
-def is_device(value: Any) -> bool:
-    """Whether torch finds this device here."""
-    import torch  # here, because help and configurations are shown without it
-
-    try:
-        device = torch.device(value)
-    except (RuntimeError, TypeError):
-        return False
-    here = {"cpu": 1, "cuda": torch.cuda.device_count()}
-    return (device.index or 0) < here.get(device.type, 0)
-
-
-Device = Annotated[
-    str, rule(is_device, "cpu; or cuda or cuda:<number>, if torch finds this GPU here")
-]
 _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )

@@ -44,8 +44,8 @@ def build_networks(
 
     Args:
         model: Node ``model`` of a configuration as composed from ``conf/``.
-        observation_spec: Spec of the observations of N environments.
-        action_spec: Spec of the actions of N environments.
+        observation_spec: That of N environments.
+        action_spec: That of N environments.
         layout: Component -> columns of the flat observation.
         num_costs: Outputs of the cost critic.
         device: Device of all parameters.

@@ -54,11 +54,7 @@ def observed_entries(observation_spec: Composite) -> list[Entry]:
 
 
 def critic_entries(chosen: Sequence[str], observation_spec: Composite) -> list[Entry]:
-    """Return the entries that critics read, if a configuration chooses them.
-
-    Args:
-        chosen: ``model.critic_observes``, of ``observation`` and ``privileged``.
-        observation_spec: Spec of the observations of N environments.
+    """Return the entries that critics read by ``model.critic_observes``.
 
     Raises:
         ValueError: If the environment does not write an entry.
@@ -151,15 +147,7 @@ def check_encoders(observed: Observed) -> None:
 
 
 class Codes(nn.Module):
-    """Encode every entry, and concatenate the codes; of several entries or of pictures.
-
-    Args:
-        observed: The observed entries, and how they are encoded.
-        device: Device of the parameters.
-
-    Attributes:
-        size: Number of outputs.
-    """
+    """Encode every entry, and concatenate the codes, ``size`` in all."""
 
     def __init__(self, observed: Observed, device: torch.device | None = None) -> None:
         super().__init__()
@@ -177,12 +165,7 @@ class Codes(nn.Module):
 class Body(Codes):
     """Encode every entry, concatenate the codes, and run a perceptron on them.
 
-    Args:
-        observed: The observed entries, and how they are encoded.
-        out_features: Outputs of the perceptron.
-        hidden_sizes: Widths of its hidden layers.
-        extra: Number of further inputs, which follow the entries and are not encoded.
-        device: Device of the parameters.
+    A number of ``extra`` inputs follow the entries, and are not encoded.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class Head(NamedTuple):
     """How the outputs of a network become a distribution of actions.
 
     Attributes:
-        num_outputs: Number of outputs of the network.
+        num_outputs: Of the network.
         parameters: Module from these, [..., num_outputs], to the distribution's parameters.
         keys: Names of these parameters.
         distribution: Class of the distribution, or a function that makes one.
@@ -67,8 +67,7 @@ def make_head(
         kind: A key of `HEADS`, or "auto".
         action_spec: Spec of the actions of N environments: [N, A] bounded, [N] or [N, A] integers,
             or [N, C] one-hot.
-        initial_log_std: Initial logarithm of the standard deviation of normal distributions; other
-            heads do not use it.
+        initial_log_std: Initial logarithm of the standard deviation of normal distributions.
         device: Device of the parameters.
 
     Raises:

@@ -166,13 +166,9 @@ def assemble_actor(
     in_keys: Sequence[NestedKey] = ("observation",),
     before: Sequence[TensorDictModuleBase] = (),
 ) -> ProbabilisticTensorDictSequential:
-    """Put a head on a network.
+    """Put a head on a network `body` that reads the entries `in_keys`.
 
-    Args:
-        body: Network from the entries ``in_keys`` to the inputs of the head.
-        head: Maps these to a distribution.
-        in_keys: Keys of the observation.
-        before: Modules that write the entries ``in_keys``, if the environment does not.
+    Modules `before` write these entries if the environment does not.
 
     Returns:
         A module with ``get_dist`` that writes the distribution's parameters, ``action`` and

@@ -91,9 +91,8 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
 def check_interface(path: Path, interface: Mapping[str, Any]) -> None:
     """Refuse a checkpoint whose policy was trained on other observations of the same size.
 
-    Args:
-        path: The checkpoint. If it says nothing of its observations, it is not checked.
-        interface: ``interface`` of the environment in which the policy is to act.
+    If it says nothing of them, it is not checked. The `interface` is that of the environment in
+    which the policy is to act.
 
     Raises:
         CheckpointError: If names of columns or kinds of sensors differ; the message says which.
@@ -134,17 +133,15 @@ def _score(path: Path, otherwise: float = -math.inf) -> float:
 class CheckpointStore:
     """The checkpoints in a run's folder.
 
-    ``last/`` keeps the newest checkpoints, ``best/`` those with the highest scores. File names
-    contain the number of environment steps.
+    ``last/`` keeps the newest checkpoints, ``best/`` those with the highest scores.
 
     Args:
         directory: Folder of the checkpoints.
         components: Parts of the run, by name.
         keep_last: Number of newest checkpoints to keep.
         keep_best: Number of best checkpoints to keep.
-        run: JSON-compatible facts of the run that every checkpoint holds. A checkpoint with other
-            facts is refused when the run is resumed.
-        interface: Returns the ``interface`` of the environment, which every checkpoint holds too.
+        run: JSON-compatible facts of the run. A checkpoint with other ones is not resumed.
+        interface: Returns the ``interface`` of the environment.
     """
 
     def __init__(
@@ -171,12 +168,7 @@ class CheckpointStore:
         self._none_yet.touch()
 
     def save(self, steps: int, facts: Mapping[str, Any] | None = None) -> Path:
-        """Write a checkpoint, and remove the oldest ones beyond ``keep_last``.
-
-        Args:
-            steps: Environment steps so far.
-            facts: JSON-compatible facts, readable without loading.
-        """
+        """Write a checkpoint with JSON-compatible facts; remove the oldest beyond ``keep_last``."""
         path = self._write(self.last, steps, facts, states_of(self._components))
         others = [other for other in checkpoints_in(self.last) if other != path]
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
@@ -201,7 +193,7 @@ class CheckpointStore:
         Args:
             steps: Environment steps of the policy.
             score: Score by which the best checkpoints are chosen.
-            facts: JSON-compatible facts, readable without loading.
+            facts: As in `save`.
             states: States of parts by name; None: the present states.
 
         Returns:

@@ -15,10 +15,8 @@ from safe_rl.files import read_json, replace_json
 def note_code(path: Path, steps: int) -> None:
     """Add the present version of the code to the file that lists the versions of a run.
 
-    Args:
-        path: The file, a list of JSON objects with ``steps``, ``version``, ``commit`` and
-            ``changed``; see `code_of`.
-        steps: Environment steps that the run has made.
+    The file is a list of JSON objects: the entries of `code_of`, and the ``steps`` that the run had
+    made.
     """
     try:
         entries = [entry for entry in read_json(path) if entry["steps"] < steps]

@@ -55,7 +55,7 @@ def learning_curves(
         table: Columns of a run's table.
         cost_limits: Cost key -> d, undiscounted cost per episode.
         episode_length: T_ep, steps of a full episode.
-        title: Title above the panels.
+        title: Text above the panels.
         measure: Which measure of episode costs is limited; another one than the mean has a line.
     """
     multipliers = {key: f"multiplier_{key}" for key in cost_limits if f"multiplier_{key}" in table}

@@ -121,15 +121,12 @@ class RunInUseError(ValueError):
 
 @contextmanager
 def lock_folder(file: Path) -> Iterator[None]:
-    """Keep other processes from writing into a run's folder; such blocks may be nested.
+    """Lock a file, to keep other processes from writing into its folder; blocks may be nested.
 
     Unfinished files of a process that was killed are removed.
 
     The lock is the kernel's (``flock``), which ends with its process. If the file system has no
     such locks, or each machine has its own, other machines are not kept from writing.
-
-    Args:
-        file: The file in the folder that is locked.
 
     Raises:
         RunInUseError: If another process holds the lock.

@@ -112,14 +112,10 @@ def role_of(key: str) -> Role:
 
 
 def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
-    """Dotted key -> value of all keys that define a run's experiment.
+    """Dotted key -> value of all keys that define the experiment of a resolved configuration.
 
     Runs for which these are equal differ only in the seed, and in where and how they were run.
-    ``init_from`` is reduced to the part that all seeds share, see
-    `safe_rl.runs.folder.common_source`.
-
-    Args:
-        config: Configuration of a run, resolved.
+    ``init_from`` is reduced to the part that all seeds share (`common_source`).
 
     Examples:
         >>> experiment_of({"env": {"name": "PointGoal1"}, "seed": 3, "num_threads": 2})
@@ -135,13 +131,10 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
 def differences(
     saved: Mapping[str, Any], given: Mapping[str, Any], allowed: str = "may_differ"
 ) -> dict[str, tuple[Any, Any]]:
-    """Dotted key -> two values, of keys that differ although their roles do not allow it.
+    """Dotted key -> saved and given value, of keys that differ although their roles forbid it.
 
-    Args:
-        saved: Configuration of a run.
-        given: Another one.
-        allowed: The attribute of `Role` that allows a difference: ``may_differ`` for a sweep,
-            ``may_change`` for ``resume=``.
+    The attribute `allowed` of `Role` allows a difference: ``may_differ`` for a sweep,
+    ``may_change`` for ``resume=``.
 
     Examples:
         >>> differences({"seed": 0, "frames": 10}, {"seed": 1, "frames": 20})
@@ -189,10 +182,6 @@ def given_settings(overrides: Sequence[str], config: DictConfig) -> dict[str, An
     """Environment, algorithm and seed of a run, and the settings of its command line.
 
     Keys that belong to the machine are left out. Lists and mappings are written as texts.
-
-    Args:
-        overrides: Those of its command line.
-        config: Configuration of the run.
     """
     given = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):

@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
-from safe_rl.runs.folder import checkpoint_name, checkpoints_in, paths_below
+from safe_rl.runs.folder import checkpoints_in, paths_below
 from safe_rl.runs.identity import measure_of, unusable_keys
 from safe_rl.runs.table import MOST_BYTES, final_figures, measured, outcome_line, read_table
 
@@ -74,10 +74,6 @@ class Run:
         vars(self).update(contents)  # found before the cached properties of these names
 
     # files
-
-    def checkpoint_file(self, kind: str, steps: int) -> Path:
-        """Path of the checkpoint of a kind with this number of environment steps."""
-        return self.checkpoints_folder / kind / checkpoint_name(steps)
 
     def checkpoints(self, kind: str) -> list[Path]:
         """Checkpoints of a kind by ascending steps, readable or not."""

@@ -2,7 +2,7 @@
 
 A `row` is one epoch, or the final figures of a run, by column; a `table` is all of it by columns. A
 `limit` is d, the undiscounted cost allowed per episode, of the cost `key`; `limits` are those of
-all costs. `measure` names the limited measure of episode costs.
+all costs. `measure` names the limited measure of episode costs, see `identity.measure_of`.
 """
 
 from __future__ import annotations
@@ -168,12 +168,6 @@ def violation(row: Mapping[str, float], key: str, limit: float) -> float:
 
 def measured(row: Mapping[str, float], key: str, limit: float | None, measure: str) -> float:
     """The measure that is compared with a limit; without a limit, the mean episode cost.
-
-    Args:
-        row: An epoch.
-        key: The cost.
-        limit: Its limit, or None.
-        measure: Name of the measure, see `safe_rl.runs.identity.measure_of`.
 
     Examples:
         >>> row = {"episode_cost": 30.0, "violation_cost": 62.0}

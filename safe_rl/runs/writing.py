@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -27,11 +28,9 @@ LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
 """Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 
 
+@dataclass
 class RunWriter:
-    """Writes configuration, table, logger, learning curves and progress bar of one run.
-
-    The folder holds ``config.yaml`` (resolved), ``code.json`` (the commits that the run used),
-    ``progress.csv`` (a row per epoch), ``curves.png`` and the files of the configured logger.
+    """Writes configuration, versions of the code, table, logger, curves and bar of one run.
 
     Args:
         run: The run; its folder is made if it does not exist.
@@ -43,24 +42,20 @@ class RunWriter:
         ValueError: If ``MPLBACKEND`` names a backend that Matplotlib does not have.
     """
 
-    def __init__(
-        self,
-        run: Run,
-        config: DictConfig,
-        cost_limits: Mapping[str, float],
-        episode_length: int,
-    ) -> None:
+    run: Run
+    config: DictConfig
+    cost_limits: Mapping[str, float]
+    episode_length: int
+
+    def __post_init__(self) -> None:
         # imported here, so that a wrong MPLBACKEND is an error before the run begins
         import matplotlib  # noqa: F401
 
-        self.run, self.directory = run, run.directory
-        self._config = config
-        self._cost_limits = dict(cost_limits)
-        self._episode_length, self._measure = episode_length, measure_of(config)
+        self._measure = measure_of(self.config)
 
     @contextmanager
     def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
-        """Keep the files open, and the folder locked.
+        """Keep logger and bar open, and the folder locked.
 
         Args:
             epoch: Epochs that a continued run has made before; None for a new run.
@@ -71,7 +66,7 @@ class RunWriter:
             SettingError: If the logger cannot be made of its settings.
             ValueError: If the table lacks epochs of the continued run.
         """
-        self.directory.mkdir(parents=True, exist_ok=True)
+        self.run.directory.mkdir(parents=True, exist_ok=True)
         with lock_folder(self.run.lock_file), ExitStack() as opened:
             self._steps_before = steps
             # a continued run replaces it after its first epoch: wrong settings fail before
@@ -85,18 +80,18 @@ class RunWriter:
                 opened.callback(self._logger.close)
             self._table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             if not epoch and (log := getattr(self._logger, "log_hparams", None)) is not None:
-                log(given_settings(self.run.overrides or (), self._config))
+                log(given_settings(self.run.overrides or (), self.config))
             # whole batches, so that the last one does not go beyond the bar
-            batch = self._config.frames_per_batch
-            total = math.ceil(self._config.frames / batch) * batch
-            bar = ProgressBar(self.directory, total, steps, self._cost_limits, self._measure)
+            batch = self.config.frames_per_batch
+            total = math.ceil(self.config.frames / batch) * batch
+            bar = ProgressBar(self.run.directory, total, steps, self.cost_limits, self._measure)
             self._bar = opened.enter_context(bar)
             yield
             self._save_config()
 
     def _make_logger(self) -> Any:
         try:
-            logger = instantiate(self._config.get("logger"), log_dir=str(self.directory))
+            logger = instantiate(self.config.get("logger"), log_dir=str(self.run.directory))
         except (SettingError, OSError):
             raise
         except Exception as error:  # those of the services have types of their own
@@ -104,7 +99,7 @@ class RunWriter:
         for name in ("log_scalar", "close"):
             if logger is not None and not callable(getattr(logger, name, None)):
                 raise SettingError(
-                    f"logger._target_={self._config.logger._target_}: it has no '{name}'. Derive a "
+                    f"logger._target_={self.config.logger._target_}: it has no '{name}'. Derive a "
                     "logger of yours from torchrl.record.loggers.Logger."
                 )
         return logger
@@ -113,7 +108,7 @@ class RunWriter:
         if not self._is_config_saved:
             # replaced atomically: a run killed here can still be continued
             with replacing(self.run.config_file) as unfinished:
-                OmegaConf.save(self._config, unfinished, resolve=True)
+                OmegaConf.save(self.config, unfinished, resolve=True)
             note_code(self.run.code_file, self._steps_before)
             self._is_config_saved = True
 
@@ -137,11 +132,11 @@ class RunWriter:
         # imported here: matplotlib takes half a second
         from safe_rl.runs.curves import learning_curves, save_figure
 
-        table, config = read_table(self.run.table_file), self._config
+        table, config = read_table(self.run.table_file), self.config
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
         try:
             figure = learning_curves(
-                table, self._cost_limits, self._episode_length, title, self._measure
+                table, self.cost_limits, self.episode_length, title, self._measure
             )
             save_figure(figure, self.run.curves_file)
         except (OSError, RuntimeError, ValueError) as error:  # such as text.usetex without LaTeX
@@ -151,15 +146,15 @@ class RunWriter:
     def summary(self) -> str:
         """One line about the end of the run."""
         table = read_table(self.run.table_file)
-        line = outcome_line(table, self._cost_limits, self._episode_length, self._measure)
-        return f"{line}; {self.directory}"
+        line = outcome_line(table, self.cost_limits, self.episode_length, self._measure)
+        return f"{line}; {self.run.directory}"
 
 
 class ProgressBar(tqdm):
     """A bar with steps, steps per second, return, and costs with their present limits.
 
     Args:
-        directory: Folder of the run; if lines replace the bar, they begin with its name.
+        directory: Folder of the run, whose name begins lines that replace the bar.
         total: Environment steps of the whole run.
         begun: Steps that a continued run has made before.
     """

@@ -26,15 +26,9 @@ _SPENT_AT_ONCE = 0.75  # share of the error left that one test spends; the first
 def error_of_next_test(level: float, spent: Iterable[float]) -> float:
     """Error probability of the next test of a run, such that all of its tests share one level.
 
-    Every test spends three quarters of the error that earlier ones have left. The sum of all errors
-    stays below 1 − ``level``, however many tests there are and whatever decides on them.
-
-    Args:
-        level: Confidence over all tests of the run.
-        spent: Error probabilities of its earlier tests.
-
-    Returns:
-        The error probability; 0 or less if earlier tests have spent all of it.
+    Every test spends three quarters of the error that earlier ones have left: the result is 0 or
+    less if they have ``spent`` all of it. The sum of all errors stays below 1 − ``level``, however
+    many tests there are and whatever decides on them.
 
     Examples:
         >>> first = error_of_next_test(0.95, [])
@@ -207,11 +201,6 @@ def rank(
 
     A policy is likely to pass if its means on these episodes are below the limits by at least z
     standard errors, where z is the normal distribution's quantile of the claim's level.
-
-    Args:
-        returns: Episode returns of every candidate.
-        costs: Cost key -> episode costs, of every candidate.
-        claims: Claim about each.
     """
 
     def key(candidate: int) -> tuple[bool, float]:

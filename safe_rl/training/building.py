@@ -101,10 +101,8 @@ def build_trainer(
         env: Seeded environment that fulfils the contract of `safe_rl.envs`. If its ``get_state``
             returns a state, checkpoints have it.
         directory: Folder of the run.
-        make_env: Function that makes an environment like ``env`` with another ``num_envs``, for
-            collectors with workers.
-        make_evaluation: Function that makes the periodic evaluation of the policy; None: no
-            evaluation.
+        make_env: Makes an environment like ``env`` with another ``num_envs``, for workers.
+        make_evaluation: Makes the periodic evaluation of the policy; None: there is none.
 
     Raises:
         ValueError: If parts of the configuration do not fit together.
@@ -163,8 +161,8 @@ def begin_from(
 
     Args:
         algorithm: The algorithm of the new run.
-        config: Its configuration. ``init_from`` is the folder of the other run, whose newest
-            checkpoint is read, or a checkpoint.
+        config: Its configuration. ``init_from`` is a checkpoint, or the folder of a run, whose
+            newest checkpoint is read.
         interface: ``interface`` of the new run's environment; None: it is not compared.
 
     Returns:

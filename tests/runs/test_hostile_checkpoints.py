@@ -121,6 +121,6 @@ def test_a_policy_of_nan_is_not_evaluated(trained, tmp_path):
             value.fill_(torch.nan)
 
     path = Run(edited(trained[0], tmp_path, "actor", edit)).newest_checkpoint()
-    config, env = trained[1].writer._config, trained[1].env
+    config, env = trained[1].writer.config, trained[1].env
     with pytest.raises(CheckpointError, match="weights that are NaN or infinite"):
         load_policy(config, env, path, torch.device("cpu"))

@@ -40,8 +40,8 @@ def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path, numbe
 
 def test_a_signal_before_the_first_epoch_lets_it_end(tmp_path):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    rows = trainer.writer.rows
-    trainer.writer.rows = lambda: signal.raise_signal(signal.SIGTERM) or rows()
+    begin = trainer._checkpoints.begin
+    trainer._checkpoints.begin = lambda: signal.raise_signal(signal.SIGTERM) or begin()
     trainer.run()
     assert trainer.stopped_by is signal.SIGTERM
     assert read_table(tmp_path / "progress.csv")["epoch"] == [1]

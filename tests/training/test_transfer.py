@@ -29,13 +29,13 @@ def same(first, second):
 
 
 def make_fresh(trained, *overrides):
-    return point_mass_trainer(trained.writer.directory.parent / "second", "seed=1", *overrides)
+    return point_mass_trainer(trained.writer.run.directory.parent / "second", "seed=1", *overrides)
 
 
 def take_over(trained, *overrides):
     fresh = make_fresh(trained, *overrides)
     assert not same(fresh.algorithm.networks["actor"], trained.algorithm.actor)
-    return fresh, begin_from(fresh.algorithm, {"init_from": trained.writer.directory})
+    return fresh, begin_from(fresh.algorithm, {"init_from": trained.writer.run.directory})
 
 
 def refuse(algorithm, source, match):
@@ -74,7 +74,7 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
 
 
 def test_the_cost_critic_stays_new_with_another_risk_measure(trained):
-    risk, source = {"_target_": "safe_rl.objectives.CVaR"}, trained.writer.directory
+    risk, source = {"_target_": "safe_rl.objectives.CVaR"}, trained.writer.run.directory
     fresh = make_fresh(trained).algorithm
     assert begin_from(fresh, {"init_from": source, "risk": risk}) == ["actor", "critic"]
     assert estimated({"risk": risk | {"tail": 0.1}}) != estimated({"risk": risk | {"tail": 0.5}})
@@ -89,7 +89,7 @@ def test_the_cost_critic_stays_new_with_another_risk_measure(trained):
     ],
 )
 def test_other_sizes_are_named_and_nothing_changes(trained, override, message):
-    refuse(make_fresh(trained, override).algorithm, trained.writer.directory, message)
+    refuse(make_fresh(trained, override).algorithm, trained.writer.run.directory, message)
 
 
 def test_what_a_run_has_not_learned_is_named(tmp_path):
