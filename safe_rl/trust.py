@@ -109,15 +109,13 @@ def _import(name: str, given: str) -> str:
                 f"ones. A file is named by its path: import=folder/{error.name}.py."
             ) from None
         frames = traceback.extract_tb(error.__traceback__)
-        # the user's own line, not the line of this package that refuses its arguments
-        users = [frame for frame in frames if not _is_inner(frame.filename)]
+        # the user's own line, not one of Python's import or of this package that refuses arguments
+        inner = str(Path(__file__).parent)
+        users = [
+            f for f in frames if not f.filename.startswith(inner) and "importlib" not in f.filename
+        ]
         place = f" ({users[-1].filename}, line {users[-1].lineno})" if users else ""
         raise ValueError(f"import={given}: {type(error).__name__}: {error}{place}.") from error
-
-
-def _is_inner(file: str) -> bool:
-    """Whether code is of this package or of Python's import."""
-    return file.startswith(str(Path(__file__).parent)) or "importlib" in file
 
 
 def check_imports(config: Mapping[Any, Any], given: str | Sequence[str] | None, run: Path) -> None:

@@ -190,7 +190,7 @@ class WorkerCollector:
         codes = {process.exitcode for process in self._processes}
         if not (died := codes - {None, 0, 128 + signal.SIGTERM}):
             return
-        self.kill()
+        self.shutdown(timeout=0.0)
         reason = "what it printed is above"
         if -signal.SIGKILL in died:
             reason = "mostly for lack of memory: use fewer environments"
@@ -199,12 +199,8 @@ class WorkerCollector:
             " The last checkpoint is whole: continue with resume=."
         )
 
-    def kill(self) -> None:
-        """End the workers at once, whatever they are doing."""
-        self.shutdown(timeout=0.0)
-
     def shutdown(self, timeout: float | None = None) -> None:
-        """End the workers, if there are any; after a number of seconds by force."""
+        """End the workers, if there are any; after ``timeout`` seconds by force."""
         workers, self._workers = self._workers, None
         if workers is not None:
             workers.shutdown(timeout=timeout)

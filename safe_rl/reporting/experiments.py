@@ -134,7 +134,8 @@ def group_runs(
     skipped: dict[Path, str] = {}
     # of several runs with one seed, the longest is kept; among equal ones the last by name
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
-        environment, title = environments[run.directory], _title(run, labels or {})
+        environment = environments[run.directory]
+        title = clean((labels or {}).get(run.algorithm) or title_of(run.algorithm), 80)
         benchmark = suite.name_of(run.settings["env"])
         experiment = Experiment(environment, title, settings[run.directory], benchmark, (run,))
         cell = cells[environment, experiment.algorithm]
@@ -145,10 +146,6 @@ def group_runs(
     ordered = [[cell[seed] for seed in sorted(cell)] for cell in cells.values()]
     experiments = [replace(seeds[0], runs=tuple(e.runs[0] for e in seeds)) for seeds in ordered]
     return sorted(experiments, key=_order), skipped
-
-
-def _title(run: Run, labels: Mapping[str, str]) -> str:
-    return clean(labels.get(run.algorithm) or title_of(run.algorithm), 80)
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:

@@ -60,11 +60,6 @@ def log_wealth(values: ArrayLike, mean: float, highest: float) -> np.ndarray:
     return wealth
 
 
-def best_growth(values: ArrayLike, mean: float, highest: float) -> float:
-    """Log of the wealth from the best of the bets, starting at 1, after all values."""
-    return float(_growth(values, mean, highest)[:, -1].max())
-
-
 def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     """Upper confidence bound of the mean of values in [0, ``highest``], for any distribution.
 
@@ -199,4 +194,5 @@ class Statement:
         if self.is_by_construction:
             return False
         needed = -math.log(1 - level) * len(self.values) / most
-        return best_growth(self.values, self.limit, self.highest) < needed / 4
+        best = _growth(self.values, self.limit, self.highest)[:, -1].max()
+        return bool(best < needed / 4)

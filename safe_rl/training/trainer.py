@@ -180,10 +180,7 @@ class Trainer:
 
     def close(self) -> None:
         """Close the collector with its workers, if any, and the environment."""
-        if isinstance(self.collector, WorkerCollector):
-            self.collector.kill()
-        else:
-            self.collector.shutdown()
+        self.collector.shutdown(timeout=0.0)
         if not self.env.is_closed:
             self.env.close()
 

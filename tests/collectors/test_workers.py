@@ -148,7 +148,7 @@ def test_workers_leave_signals_to_the_first_process_from_their_start_on():
     for _ in range(2):
         assert next(batches).shape == (4, 20)
     (process,) = active_children()
-    collector.kill()
+    collector.shutdown(timeout=0.0)
     process.join(300)
     assert not process.is_alive()
 
