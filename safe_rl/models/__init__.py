@@ -7,8 +7,14 @@ from safe_rl.models.collecting_policies import (
     HeldActions,
     make_behaviour,
 )
-from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector, take_in
-from safe_rl.models.networks import make_actor, make_critic
+from safe_rl.models.networks import (
+    InputScale,
+    RunningScale,
+    input_scale_vector,
+    make_actor,
+    make_critic,
+    take_in,
+)
 from safe_rl.models.replay_networks import (
     EnsembleMLP,
     QEnsemble,

@@ -21,8 +21,7 @@ from safe_rl.models.encoders import (
     observed_entries,
 )
 from safe_rl.models.heads import AUTO, Head, make_head
-from safe_rl.models.input_scales import RunningScale
-from safe_rl.models.networks import Chain, Tanh, assemble_actor, perceptron
+from safe_rl.models.networks import Chain, RunningScale, Tanh, assemble_actor, perceptron
 
 _AS_IT_IS: Mapping[str, Any] = {"vector": []}
 

@@ -12,8 +12,13 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import ConvNet, GRUModule, set_recurrent_mode
 
-from safe_rl.models.input_scales import InputScale, RunningScale, input_scale_vector
-from safe_rl.models.networks import Tanh, perceptron
+from safe_rl.models.networks import (
+    InputScale,
+    RunningScale,
+    Tanh,
+    input_scale_vector,
+    perceptron,
+)
 
 TO_FLATTEN = (
     "make the environment flatten them: with env.observation_flatten=true in Safety Gym, else with "

@@ -22,8 +22,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
 
 from safe_rl.models.heads import Shape, action_sampler
-from safe_rl.models.input_scales import InputScale
-from safe_rl.models.networks import Chain
+from safe_rl.models.networks import Chain, InputScale
 
 _SCALE_FLOOR = 1e-3
 

@@ -118,7 +118,6 @@ def build_trainer(
         env=env,
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
-        cost_limits=cost_limits,
         writer=writer,
         config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),

@@ -44,7 +44,6 @@ class Trainer:
         env: Environment that the collector steps.
         algorithm: The algorithm to train.
         collector: Endless collector of [N, T] batches with the algorithm's policy.
-        cost_limits: Cost key -> d, undiscounted cost per episode, for the best checkpoints.
         writer: Writes the files of the run.
         config: Configuration of the run, for ``frames`` and ``checkpoint``.
         evaluation: Periodic evaluation of the policy, called after every epoch, or None.
@@ -64,7 +63,6 @@ class Trainer:
         algorithm: Algorithm,
         collector: Collector | WorkerCollector,
         *,
-        cost_limits: Mapping[str, float],
         writer: RunWriter,
         config: DictConfig,
         evaluation: Evaluator | None = None,
@@ -93,9 +91,9 @@ class Trainer:
             (self.snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._checkpoint_interval = config.frames, config.checkpoint.interval
-        self._open_checkpoints(config, cost_limits)
+        self._open_checkpoints(config)
 
-    def _open_checkpoints(self, config: DictConfig, cost_limits: Mapping[str, float]) -> None:
+    def _open_checkpoints(self, config: DictConfig) -> None:
         """Name the parts of a checkpoint, choose those of a policy, and open the run's store."""
         parts: dict[str, Stateful] = {
             **self.algorithm.checkpoint_components(),
@@ -107,7 +105,7 @@ class Trainer:
             parts["env"] = self.snapshot
         self._selection = CheckpointSelection(
             {name: part for name, part in parts.items() if name not in _FOR_RESUMING},
-            cost_limits,
+            self.writer.cost_limits,
             over=config.checkpoint.best_over,
             steps_per_epoch=config.frames_per_batch / self.env.batch_size.numel(),
             longest=self.env.max_episode_steps,
