@@ -140,9 +140,8 @@ def instantiate(
     Args:
         node: The node. Those within it that have a ``_target_`` are built first; one with
             ``_partial_: true`` becomes a function that takes the remaining arguments later.
-        optional: Arguments that the outermost target gets if its signature has them and they are
-            not None.
-        objects: Further arguments of the outermost target. They are passed on without a copy.
+        optional: Arguments that the target gets if its signature has them and they are not None.
+        objects: Further arguments of the target, passed on without a copy.
 
     Returns:
         The object; None if the node or its ``_target_`` is null.

@@ -22,11 +22,8 @@ class EpisodeError(ValueError):
 def check_steps(entries: Mapping[NestedKey, Tensor], cost_keys: Sequence[NestedKey]) -> None:
     """Refuse steps with NaN or infinite entries, or with costs below 0: nothing is learned of them.
 
-    The host reads one tensor from the device, unless something is wrong.
-
-    Args:
-        entries: Key -> entry [N, T, …]; only floating-point numbers are checked.
-        cost_keys: Those of the keys that are costs.
+    Entries are [N, T, …]; only floating-point numbers are checked. The host reads one tensor from
+    the device, unless something is wrong.
 
     Raises:
         FloatingPointError: If an entry is not finite; the message names entry, row and step.

@@ -22,6 +22,7 @@ from safe_rl.algorithms.algorithm_contract import Stateful, states_of
 from safe_rl.collectors import match_columns
 from safe_rl.files import all_printable, load_tensors, printable, save_tensors
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, checkpoints_in
+from safe_rl.runs.identity import flatten
 
 
 def read_facts(path: Path) -> dict[str, Any]:
@@ -56,25 +57,15 @@ def policy_hash(path: Path) -> str:
     An exported policy has the same hash as the checkpoint from which it comes.
     """
     parts = _read(path, lazy=True)["parts"]
-    tensors = flatten_tensors(parts.get("actor", parts))
     digest = sha256()
-    for name, tensor in sorted(tensors.items()):
+    for name, tensor in sorted(flatten(parts.get("actor", parts)).items()):
+        if not isinstance(tensor, Tensor):
+            continue
         digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
         digest.update(
             tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
         )
     return digest.hexdigest()
-
-
-def flatten_tensors(state: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
-    """All tensors of nested dictionaries by dotted names."""
-    tensors: dict[str, Tensor] = {}
-    for name, value in state.items():
-        if isinstance(value, Mapping):
-            tensors |= flatten_tensors(value, f"{prefix}{name}.")
-        elif isinstance(value, Tensor):
-            tensors[f"{prefix}{name}"] = value
-    return tensors
 
 
 def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:

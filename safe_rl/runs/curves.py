@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -74,8 +75,9 @@ def learning_curves(
             _draw(costs, steps, judged, f"C{len(cost_limits) + index + 1}", f"{key} as limited")
         if key in cost_limits:
             limit, per_step = cost_limits[key], cost_limits[key] / episode_length
-            _draw_limit(costs, limit, colour, f"limit {limit:g}")
-            _draw_limit(rates, per_step, colour, f"limit / steps = {per_step:g}")
+            dashed: dict[str, Any] = {"color": colour, "linestyle": "--", "linewidth": 1}
+            costs.axhline(limit, label=f"limit {limit:g}", **dashed)
+            rates.axhline(per_step, label=f"limit / steps = {per_step:g}", **dashed)
         if key in multipliers:
             heights = np.asarray(table[multipliers[key]], dtype=float)
             marker = point_marker(steps)
@@ -103,10 +105,6 @@ def _label(figure: Figure, axes: Axes, name: str, *, from_zero: bool) -> None:
         fontsize="small", frameon=False, loc="upper center",
         bbox_to_anchor=(0.5, 0.0), bbox_transform=axes.transAxes + below,
     )  # fmt: skip
-
-
-def _draw_limit(axes: Axes, height: float, colour: str, label: str) -> None:
-    axes.axhline(height, color=colour, linestyle="--", linewidth=1, label=label)
 
 
 def _draw(
