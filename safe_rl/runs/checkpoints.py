@@ -57,10 +57,10 @@ def policy_hash(path: Path) -> str:
     An exported policy has the same hash as the checkpoint from which it comes.
     """
     parts = _read(path, lazy=True)["parts"]
+    flat = flatten(parts.get("actor", parts))
+    tensors = {name: value for name, value in flat.items() if isinstance(value, Tensor)}
     digest = sha256()
-    for name, tensor in sorted(flatten(parts.get("actor", parts)).items()):
-        if not isinstance(tensor, Tensor):
-            continue
+    for name, tensor in sorted(tensors.items()):
         digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
         digest.update(
             tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
