@@ -26,8 +26,6 @@ from safe_rl.naming import did_you_mean
 
 PICTURES = ("gif", "webp")
 """Suffixes of animated pictures."""
-
-
 _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )

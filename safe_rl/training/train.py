@@ -204,7 +204,7 @@ def _prepare(
         say(algorithm.schedule)
     if continues and trainer.resume():
         print(f"Resuming after {trainer.progress.steps:,} of {config.frames:,} frames.")
-        if trainer.begins_anew:
+        if trainer.snapshot is None:
             print("The state of its environments is not stored: they begin new episodes.")
         if algorithm.lost_on_resume:
             print(algorithm.lost_on_resume)
