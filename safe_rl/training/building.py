@@ -119,7 +119,6 @@ def build_trainer(
         algorithm=algorithm,
         collector=_build_collector(config, env, make_env, algorithm),
         writer=writer,
-        config=config,
         evaluation=None if make_evaluation is None else make_evaluation(algorithm.policy),
         recording=recording,
     )

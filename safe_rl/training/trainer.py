@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -44,8 +43,7 @@ class Trainer:
         env: Environment that the collector steps.
         algorithm: The algorithm to train.
         collector: Endless collector of [N, T] batches with the algorithm's policy.
-        writer: Writes the files of the run.
-        config: Configuration of the run, for ``frames`` and ``checkpoint``.
+        writer: Writes the files of the run; it has the configuration and the limits of costs.
         evaluation: Periodic evaluation of the policy, called after every epoch, or None.
         recording: Writes every batch to disk, or None.
 
@@ -64,11 +62,10 @@ class Trainer:
         collector: Collector | WorkerCollector,
         *,
         writer: RunWriter,
-        config: DictConfig,
         evaluation: Evaluator | None = None,
         recording: Recording | None = None,
     ) -> None:
-        self.algorithm = algorithm
+        self.algorithm, config = algorithm, writer.config
         self.accounting = EpisodeAccounting(
             env.batch_size.numel(),
             env.cost_keys,
@@ -91,10 +88,11 @@ class Trainer:
             (self.snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
         self._frames, self._checkpoint_interval = config.frames, config.checkpoint.interval
-        self._open_checkpoints(config)
+        self._open_checkpoints()
 
-    def _open_checkpoints(self, config: DictConfig) -> None:
+    def _open_checkpoints(self) -> None:
         """Name the parts of a checkpoint, choose those of a policy, and open the run's store."""
+        config = self.writer.config
         parts: dict[str, Stateful] = {
             **self.algorithm.checkpoint_components(),
             "accounting": self.accounting,
