@@ -199,6 +199,8 @@ def _unknown_choice(error: MissingConfigException) -> str:
         known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
     file = re.match(r"In '(?!config)([^']+)'", str(error))
     place = f"{file[1]}.yaml: " if file else ""
+    if name in known:
+        return f"{place}there is no '{name}': --config-path replaces conf/, --config-dir adds."
     all_of_them = f"There are {', '.join(known)}"
     listed = all_of_them if len(known) <= _MOST_LISTED else f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")

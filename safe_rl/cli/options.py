@@ -6,6 +6,7 @@ dataclass: pydantic checks them by their annotations, and their help texts make 
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -221,6 +222,7 @@ def keep_streams() -> None:
     in ASCII, are escaped: neither may end a run or change the exit status. Warnings, which may
     quote files of others, are shown without control characters.
     """
+    logging.raiseExceptions = False  # Hydra's log into a closed pipe, as of `--info | head`
     warnings.formatwarning = lambda *parts, **names: printable(_FORMAT(*parts, **names))
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)

@@ -156,10 +156,12 @@ class Summary(Callback):
         """Print how the jobs have ended.
 
         Raises:
-            SystemExit: With status 1, if a run is not finished.
+            SystemExit: With status 1, if a run is not finished, or if there is none.
         """
         lines = self._log.read_text().splitlines() if self._log.exists() else []
         last = {job: (state, place) for job, state, place in map(json.loads, lines)}.values()
+        if not last:
+            sys.exit("The sweep has no runs: a glob(…) or range(…) in it is empty.")
         unfinished = [f"  {state}: {place}" for state, place in last if state != "done"]
         print(f"Sweep: {len(last) - len(unfinished)} of {len(last)} runs are finished.")
         if unfinished:

@@ -78,21 +78,27 @@ def prepare(words: Sequence[str]) -> list[str]:
     ``conf/config.yaml``.
 
     Raises:
-        ValueError: If a module, a slate or a run cannot be used.
+        ValueError: If a module, a slate, a run or a word cannot be used.
 
     Examples:
         >>> prepare(["-m", "slate=SGPoint", "seed=0"])
-        ['-m', 'env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0']
+        ['env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0', '-m']
     """  # noqa: E501
     store_configs(_shown(words))
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)
     slates, words = take_word("slate", words)
+    for word in words:
+        if re.match(r"hydra\.(launcher|sweeper)=\w", word):
+            raise ValueError(f"{word}: it is chosen with a slash, {word.replace('.', '/', 1)}.")
+    # Hydra's parser of flags takes overrides only where they stand together
+    flags = [word for before, word in pairwise(["", *words]) if _is_of_flags(before, word)]
+    words = [word for word in words if word not in flags]
     if runs:
         directory = Path(runs[-1]).expanduser().absolute()
-        ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, words))
-        return [f"--config-name={RESUMED}", *words]
+        ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, [*words, *flags]))
+        return [*words, *flags, f"--config-name={RESUMED}"]
     new = [] if modules is None else [*overrides_of({"import": modules})]
     for name in slates:
         if name not in SLATES:
@@ -101,14 +107,14 @@ def prepare(words: Sequence[str]) -> list[str]:
                 f"Slates are: {', '.join(SLATES)}."
             )
         new.append(f"env={','.join(SLATES[name])}")
-    # Hydra's parser of flags takes overrides only where they stand together
-    overrides = (
-        place
-        for place, (before, word) in enumerate(pairwise(["", *words]))
-        if re.match("[^-=][^=]*=", word) and not re.fullmatch("-c[dp]|--config-(dir|path)", before)
-    )
-    place = next(overrides, 0)
-    return [*words[:place], *new, *words[place:]]
+    return [*new, *words, *flags]
+
+
+def _is_of_flags(before: str, word: str) -> bool:
+    """Whether a word is a flag of Hydra, or the value of the one before it."""
+    takes_any = re.fullmatch("-c[dnp]|--config-(dir|name|path)", before)
+    takes_plain = re.fullmatch("-[cip]|--(cfg|info|package|experimental-rerun)", before)
+    return word.startswith("-") or bool(takes_any or (takes_plain and "=" not in word))
 
 
 def _shown(words: Sequence[str]) -> list[str] | None:

@@ -321,4 +321,6 @@ class Run:
 def find_runs(root: Path, most: int | None = None) -> list[Run]:
     """Runs below a folder, itself included, in the order of their paths; see `paths_below`."""
     folders = (path.parent for path in paths_below(root, Run.config_file.name, most))
-    return [Run(folder) for folder in folders if folder.name != Run.notes_folder.name]
+    # Hydra and Weights & Biases write files of that name, too
+    others = (Run.notes_folder.name, "wandb/*run-*/files")
+    return [Run(folder) for folder in folders if not any(map(folder.match, others))]

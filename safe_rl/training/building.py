@@ -170,7 +170,7 @@ def begin_from(
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
             shapes or were trained on other observations. Then nothing has been changed.
     """
-    source = Path(config["init_from"])
+    source = Path(config["init_from"]).expanduser()
     if not source.exists():
         raise CheckpointError(f"init_from={source}: there is no such folder or file.")
     checkpoint = Run(source).newest_checkpoint() if source.is_dir() else source

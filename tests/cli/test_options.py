@@ -1,5 +1,7 @@
 """Options of the command-line tools, and the extras they need."""
 
+import io
+import logging
 import re
 from dataclasses import fields
 from pathlib import Path
@@ -8,7 +10,14 @@ import numpy as np
 import pytest
 
 from safe_rl.checks import SettingError
-from safe_rl.cli.options import OptionError, make_options, read_options, run_command, usage
+from safe_rl.cli.options import (
+    OptionError,
+    keep_streams,
+    make_options,
+    read_options,
+    run_command,
+    usage,
+)
 from safe_rl.evaluation import evaluate
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
@@ -21,6 +30,16 @@ def test_values_are_read_with_their_types_and_mappings_without_spaces_too():
     assert read_options(given, EvaluationOptions) == EvaluationOptions(
         episodes=1000, video=True, seed=3, env=env, cost_limits={**limits, "cost_hazards": 5.0}
     )
+
+
+def test_a_log_into_a_closed_pipe_brings_no_traceback(monkeypatch, capsys):
+    """`python train.py --info | head` printed one for every line."""
+    monkeypatch.setattr(logging, "raiseExceptions", True)
+    keep_streams()
+    closed = io.StringIO()
+    closed.close()
+    logging.StreamHandler(closed).handle(logging.makeLogRecord({"msg": "line"}))
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("name", ["off", "yes", "007", "1e3", "2.50", "'a b'", "x=y"])

@@ -1,7 +1,7 @@
 """Words on the command line: a wrong one is refused in one line that names what was meant."""
 
 import pytest
-from commands import composed
+from commands import composed, status_of
 
 from safe_rl.cli import train
 from safe_rl.scores.benchmark import SLATES
@@ -19,6 +19,7 @@ RIGHT = [
     ["slate=SGPoint", "seed=0", "algo=cpo", "-m"],
     ["-m", "import=json", "seed=0,1", "--config-dir", "conf"],
     ["import=json", "--config-dir=conf", "env=PointGoal1", "seed=3"],
+    ["algo=cpo", "-m", "seed=0,1", "--config-dir", "conf", "env=CarGoal1"],
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
@@ -40,6 +41,7 @@ WRONG = {
     "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
     "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
     "slate=SG7": "Unknown slate 'SG7'",
+    "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
     'cost_limits={"cost": 3}': r"cannot be read.*have no quotes: '\{cost: 10\}'\.$",
@@ -64,7 +66,13 @@ def test_right_words_pass(arguments):
 
 def test_the_value_of_a_flag_is_no_override():
     words = ["--config-dir", "a=b", "slate=SG6", "seed=0"]
-    assert train.prepare(words) == [*words[:2], f"env={','.join(SLATES['SG6'])}", "seed=0"]
+    assert train.prepare(words) == [f"env={','.join(SLATES['SG6'])}", "seed=0", *words[:2]]
+
+
+def test_a_folder_in_place_of_the_packages_is_named(tmp_path):
+    (tmp_path / "mine.yaml").write_text("defaults: [config]\n")
+    message = "mine.yaml: there is no 'config': --config-path replaces conf/"
+    assert message in status_of(f"--config-path={tmp_path}", "--config-name=mine")
 
 
 @pytest.mark.parametrize("argument", WRONG)

@@ -84,6 +84,18 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == "Sweep: 3 of 3 runs are finished.\n"
 
 
+def test_sweeps_and_runs_that_begin_in_the_same_second_have_files_of_their_own():
+    """The jobs of a cluster's array do; the first sweep called the others' runs interrupted."""
+    nodes = [composed()[0].hydra for _ in range(3)]
+    assert len({node.callbacks.summary.log for node in nodes}) == 3
+    assert len({node.run.dir for node in nodes}) == 3
+
+
+def test_a_sweep_without_a_run_fails(tmp_path):
+    with pytest.raises(SystemExit, match=r"no runs: a glob"):
+        Summary(f"{tmp_path}/jobs.jsonl").on_multirun_end(None)
+
+
 def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(LINE_SECONDS, "0")

@@ -103,6 +103,13 @@ def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
         find_runs(tmp_path / "elsewhere")
 
 
+def test_files_of_weights_and_biases_are_no_run(tmp_path):
+    files = write_run(tmp_path, folder="a") / "wandb" / "offline-run-20260131_120000-ab12" / "files"
+    files.mkdir(parents=True)
+    (files / "config.yaml").write_text("wandb_version: 1\n")
+    assert find_runs(tmp_path)[1] == {}
+
+
 def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):
     rows = {"returns": (1.0, 2.0), "costs": (1, 1), "rates": (0, 0)}
     longer = write_run(tmp_path, **rows, frames=2000, folder="longer")

@@ -101,6 +101,8 @@ def test_what_a_run_has_not_learned_is_named(tmp_path):
     refuse(algorithm, clone, "torchrl has no critic, which this run needs")
 
 
-def test_a_folder_without_a_checkpoint(trained, tmp_path):
-    with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
-        begin_from(trained.algorithm, {"init_from": tmp_path})
+def test_a_folder_without_a_checkpoint(trained, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for place in (tmp_path, "~"):
+        with pytest.raises(CheckpointError, match=r"init_from=.*no checkpoint"):
+            begin_from(trained.algorithm, {"init_from": place})
