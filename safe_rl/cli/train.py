@@ -93,8 +93,9 @@ def prepare(words: Sequence[str]) -> list[str]:
         if re.match(r"hydra\.(launcher|sweeper)=\w", word):
             raise ValueError(f"{word}: it is chosen with a slash, {word.replace('.', '/', 1)}.")
     # Hydra's parser of flags takes overrides only where they stand together
-    flags = [word for before, word in pairwise(["", *words]) if _is_of_flags(before, word)]
-    words = [word for word in words if word not in flags]
+    pairs = list(pairwise(["", *words]))
+    flags = [word for before, word in pairs if _is_of_flags(before, word)]
+    words = [word for before, word in pairs if not _is_of_flags(before, word)]
     if runs:
         directory = Path(runs[-1]).expanduser().absolute()
         ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, [*words, *flags]))
