@@ -8,9 +8,9 @@ import torch
 from run_configs import compose_config, without_times
 
 from safe_rl.cli.sweeps import run_job
+from safe_rl.evaluation import certifying
 from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.run import Run
-from safe_rl.training import finish
 from safe_rl.training.train import is_expected, train
 from safe_rl.training.trainer import Trainer
 
@@ -67,7 +67,7 @@ def test_a_job_that_dies_before_its_certificate_is_certified_by_the_next_sweep(
     monkeypatch.undo()
     assert run_job(small(), None, Run(tmp_path / "run")) > -1e9
     assert Run(tmp_path / "run").certificate["candidates"][-1] == 80
-    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("certified twice"))
+    monkeypatch.setattr(certifying, "certify", lambda *_, **__: pytest.fail("certified twice"))
     run_job(small(), None, Run(tmp_path / "run"))
 
 
@@ -76,7 +76,7 @@ def test_a_finished_run_is_tested_again_if_other_options_are_given(tmp_path, mon
     more = "certificate.episodes=5"
     train(small(more), run.directory, continues=True)
     assert run.certificate["most_episodes"] == 5
-    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("tested again"))
+    monkeypatch.setattr(certifying, "certify", lambda *_, **__: pytest.fail("tested again"))
     train(small(more), run.directory, continues=True)
     train(small(), run.directory, continues=True)
 
@@ -88,14 +88,16 @@ def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, m
     config = [*words, "logger=none", "num_threads=1", "certificate.ranking=2"]
     train(compose_config(*config, "certificate.episodes=0"), tmp_path / "run")
     tested = []
-    monkeypatch.setattr(finish, "certify", lambda directory, *_, **__: tested.append(directory))
+    monkeypatch.setattr(certifying, "certify", lambda directory, *_, **__: tested.append(directory))
     train(compose_config(*config, "certificate.episodes=5"), tmp_path / "run", continues=True)
     assert tested == [tmp_path / "run"]
 
 
 def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
     run = train(small("certificate.episodes=0"), tmp_path / "run")
-    monkeypatch.setattr(finish, "certify", lambda *_, **__: pytest.fail("tested without the lock"))
+    monkeypatch.setattr(
+        certifying, "certify", lambda *_, **__: pytest.fail("tested without the lock")
+    )
     ready, proceed = os.pipe(), os.pipe()
     child = os.fork()
     if not child:
@@ -106,7 +108,7 @@ def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
     os.read(ready[0], 1)
     try:
         with pytest.raises(RunInUseError):
-            finish.certify_run(run.directory)
+            certifying.certify_run(run.directory)
     finally:
         os.write(proceed[1], b"x")
         os.waitpid(child, 0)
