@@ -209,6 +209,7 @@ def check_settings(config: DictConfig) -> None:
                 del config[name]
             if config.algo.get("constrained") is False:  # presets have limits for others
                 config.pop("limits", None)
+        _check_parts(config)
         _check(General, config, "")
         _check(Algo, config.algo, "algo", is_open=True)
         _check(CertificateOptions, config.certificate, "certificate")
@@ -227,10 +228,26 @@ def check_settings(config: DictConfig) -> None:
 
 
 def _check_together(config: DictConfig) -> None:
-    """Refuse settings that are right by themselves and not together.
+    """Refuse settings that are right by themselves and not together."""
+    if not config.collector.get("_target_") and config.collector.get("num_collectors") != 1:
+        raise SettingError(
+            "collector.num_collectors: collector=local is one process; for more use "
+            "collector=process or collector=ray."
+        )
+    measure = (config.get("risk") or {}).get("_target_")
+    if measure is not None and not is_to_keep_limits(config):
+        raise SettingError(
+            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
+            "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
+        )
+    if (cap := config.certificate.get("cap")) is not None:
+        from safe_rl.scores.certificate import Claim  # it imports SciPy
 
-    A preset or a command may have added a part to an algorithm that does not have it.
-    """
+        Claim(config.cost_limits, cap=cap)  # refuses a cap that says nothing
+
+
+def _check_parts(config: DictConfig) -> None:
+    """Refuse what a preset or a command has added to an algorithm without such a part."""
     updates = (config.get(name) or {} for name in ("policy_update", "critic_update"))
     if config.get("compile") and not any("compile" in update for update in updates):
         warnings.warn(
@@ -247,21 +264,6 @@ def _check_together(config: DictConfig) -> None:
         if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):
             words = "" if config.preset in ("default", "paper") else f"preset={config.preset}: "
             raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.")
-    if not config.collector.get("_target_") and config.collector.get("num_collectors") != 1:
-        raise SettingError(
-            "collector.num_collectors: collector=local is one process; for more use "
-            "collector=process or collector=ray."
-        )
-    measure = (config.get("risk") or {}).get("_target_")
-    if measure is not None and not is_to_keep_limits(config):
-        raise SettingError(
-            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
-            "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
-        )
-    if (cap := config.certificate.get("cap")) is not None:
-        from safe_rl.scores.certificate import Claim  # it imports SciPy
-
-        Claim(config.cost_limits, cap=cap)  # refuses a cap that says nothing
 
 
 def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> None:
