@@ -149,11 +149,11 @@ def draw_benchmark(
             axes[panel].axhline(height, **LIMIT_STYLE)
         axes[0].set_title(f"{name}\n{_coverage(shown)}", fontsize=8)
         axes[2].set_xlabel("environment steps", fontsize=8)
+        for axis in axes if not shown else ():
+            axis.text(0.5, 0.5, "no runs", transform=axis.transAxes, ha="center", color="0.5")
+            axis.set_yticks([])
+    for axes in panels.T:  # which share their steps: when all are drawn
         set_axes(axes, ticks=3)
-        if not shown:
-            for axis in axes:
-                axis.text(0.5, 0.5, "no runs", transform=axis.transAxes, ha="center", color="0.5")
-                axis.set_yticks([])
     for axis, title in zip(panels[:, 0], _TITLES, strict=True):
         axis.set_ylabel(title, fontweight="bold")
     add_legend(figure, panels.ravel())
