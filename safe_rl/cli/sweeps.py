@@ -26,9 +26,9 @@ from safe_rl.cli.config import check_settings
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import differences, is_to_keep_limits
+from safe_rl.runs.progress_bar import LINE_SECONDS
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import violation
-from safe_rl.runs.writing import LINE_SECONDS
 from safe_rl.trust import import_modules
 
 _GRACE = 30.0
@@ -133,7 +133,7 @@ class Summary(Callback):
         """Note that a job has begun; another line follows unless it is interrupted."""
         if config.hydra.mode == RunMode.MULTIRUN:
             if os.getppid() == self._process:
-                from safe_rl.collectors.workers import end_with_parent  # with torch
+                from safe_rl.collectors.processes import end_with_parent  # with torch
 
                 # otherwise the job would go on, or wait for ever, after the sweep was killed
                 end_with_parent(_GRACE)

@@ -6,6 +6,7 @@ after an interruption are the same as before.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -32,12 +33,13 @@ class TensorboardLogger(TorchRLTensorboardLogger):
         ValueError: If ``exp_name`` is no name of a folder.
     """
 
-    log_hparams = None  # TorchRL's method would make another run of TensorBoard for the settings
-
     def __init__(self, exp_name: Text, log_dir: str) -> None:
         if Path(exp_name).name != exp_name or exp_name == "..":
             raise ValueError(f"logger.exp_name={exp_name}: it names a folder in that of the run.")
         super().__init__(exp_name, log_dir)
+
+    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
+        """Log no settings: TorchRL's method would make another run of TensorBoard for them."""
 
     def close(self, timeout: float | None = None) -> None:
         """Write what is buffered."""

@@ -1,31 +1,25 @@
-"""The files that a run writes while it trains, and its progress bar."""
+"""The files that a run writes while it trains."""
 
 from __future__ import annotations
 
 import math
-import os
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from safe_rl.checks import SettingError
 from safe_rl.files import replacing
 from safe_rl.runs.code_version import note_code
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings, measure_of
+from safe_rl.runs.progress_bar import ProgressBar
 from safe_rl.runs.run import Run
-from safe_rl.runs.table import TableWriter, measured, outcome_line, read_table
+from safe_rl.runs.table import TableWriter, outcome_line, read_table
 from safe_rl.trust import instantiate
-
-LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
-"""Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 
 
 @dataclass
@@ -79,13 +73,15 @@ class RunWriter:
             if self._logger is not None:
                 opened.callback(self._logger.close)
             self._table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
-            if not epoch and (log := getattr(self._logger, "log_hparams", None)) is not None:
-                log(given_settings(self.run.overrides or (), self.config))
+            if self._logger is not None and not epoch:
+                given = given_settings(self.run.overrides or (), self.config)
+                self._logger.log_hparams(given)
             # whole batches, so that the last one does not go beyond the bar
             batch = self.config.frames_per_batch
             total = math.ceil(self.config.frames / batch) * batch
-            bar = ProgressBar(self.run.directory, total, steps, self.cost_limits, self._measure)
-            self._bar = opened.enter_context(bar)
+            directory, limits = self.run.directory, self.cost_limits
+            self._bar = ProgressBar(directory, total, steps, limits, self._measure)
+            opened.callback(self._bar.close)
             yield
             self._save_config()
 
@@ -96,7 +92,7 @@ class RunWriter:
             raise
         except Exception as error:  # those of the services have types of their own
             raise SettingError(f"logger: {' '.join(str(error).split())}") from error
-        for name in ("log_scalar", "close"):
+        for name in ("log_scalar", "log_hparams", "close"):
             if logger is not None and not callable(getattr(logger, name, None)):
                 raise SettingError(
                     f"logger._target_={self.config.logger._target_}: it has no '{name}'. Derive a "
@@ -148,82 +144,3 @@ class RunWriter:
         table = read_table(self.run.table_file)
         line = outcome_line(table, self.cost_limits, self.episode_length, self._measure)
         return f"{line}; {self.run.directory}"
-
-
-class ProgressBar(tqdm):
-    """A bar with steps, steps per second, return, and costs with their present limits.
-
-    Args:
-        directory: Folder of the run, whose name begins lines that replace the bar.
-        total: Environment steps of the whole run.
-        begun: Steps that a continued run has made before.
-    """
-
-    def __init__(
-        self,
-        directory: Path,
-        total: int,
-        begun: int,
-        limits: Mapping[str, float],
-        measure: str = "mean",
-    ) -> None:
-        self._name = os.path.relpath(directory)
-        self._seconds = float(os.environ.get(LINE_SECONDS, "inf"))
-        self._printed = monotonic()
-        options = {"disable": True} if math.isfinite(self._seconds) else {}
-        super().__init__(
-            total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
-            smoothing=0.1, **options,
-        )  # fmt: skip
-        self._limits, self._measure = limits, measure
-
-    def add(self, row: Mapping[str, float]) -> None:
-        """Show an epoch, given as its row of the table."""
-        figures = shown(row, self._limits, self._measure)
-        self.set_postfix(figures, refresh=False)
-        self.update(int(row["steps"]) - self.n)
-        if monotonic() - self._printed >= self._seconds:
-            self._printed = monotonic()
-            words = [f"{row['steps'] / self.total:.0%} of {self.total:,} steps"]
-            words += [f"{row['steps_per_second']:,.0f} steps/s"]
-            words += [f"{name}={value}" for name, value in figures.items()]
-            print(f"{self._name}: {', '.join(words)}", file=sys.stderr, flush=True)
-
-
-def shown(
-    row: Mapping[str, float], limits: Mapping[str, float], measure: str = "mean"
-) -> dict[str, str]:
-    """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
-
-    Return and costs are means over the episodes that ended in the epoch. While an algorithm lowers
-    its limit, the word "target" precedes the present one.
-
-    Examples:
-        >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
-        >>> shown(row, {"cost": 25.0})
-        {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
-        >>> shown(row | {"estimate_cost": 31.0, "target_cost": 29.0}, {"cost": 25.0})["cost"]
-        '30.0/target 29'
-    """
-    if math.isnan(row["episode_return"]):
-        return {"episodes": "none has ended"}
-    figures = {"return": f"{row['episode_return']:.2f}"}
-    for key in list(limits) or ["cost"]:
-        value = measured(row, key, limits.get(key), measure)
-        figures[key] = f"{value:.1f}{_present_limit(row, key, limits)}"
-    multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
-    if multipliers:
-        figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
-    return figures
-
-
-def _present_limit(row: Mapping[str, float], key: str, limits: Mapping[str, float]) -> str:
-    """The present limit of a cost, to follow its figure."""
-    if key not in limits:
-        return ""
-    target, limit = row.get(f"target_{key}", -math.inf), limits[key]
-    if target <= limit:
-        return f"/{limit:g}"
-    if target > row.get(f"estimate_{key}", math.inf):
-        return " (no limit yet)"
-    return f"/target {target:.3g}"

@@ -18,9 +18,9 @@ from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import Summary, run_in_sweep, run_job
 from safe_rl.runs.checkpoints import read_facts
+from safe_rl.runs.progress_bar import LINE_SECONDS, ProgressBar
 from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import final_figures, read_table
-from safe_rl.runs.writing import LINE_SECONDS, ProgressBar
 
 
 @pytest.mark.parametrize(("workers", "threads"), [(1, 8), (2, 4), (3, 2), (16, 1)])

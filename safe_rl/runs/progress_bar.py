@@ -1,0 +1,100 @@
+"""The progress bar of a run."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from time import monotonic
+
+from tqdm import tqdm
+
+from safe_rl.runs.table import measured
+
+LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
+"""Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
+
+
+class ProgressBar:
+    """A bar with steps, steps per second, return, and costs with their present limits.
+
+    Args:
+        directory: Folder of the run; if lines replace the bar, they begin with its name.
+        total: Environment steps of the whole run.
+        begun: Steps that a continued run has made before.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        total: int,
+        begun: int,
+        limits: Mapping[str, float],
+        measure: str = "mean",
+    ) -> None:
+        self._name = os.path.relpath(directory)
+        self._seconds = float(os.environ.get(LINE_SECONDS, "inf"))
+        self._printed = monotonic()
+        options = {"disable": True} if math.isfinite(self._seconds) else {}
+        self._bar = tqdm(
+            total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
+            smoothing=0.1, **options,
+        )  # fmt: skip
+        self._limits, self._measure = limits, measure
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """Show an epoch, given as its row of the table."""
+        figures = shown(row, self._limits, self._measure)
+        self._bar.set_postfix(figures, refresh=False)
+        self._bar.update(int(row["steps"]) - self._bar.n)
+        if monotonic() - self._printed >= self._seconds:
+            self._printed = monotonic()
+            words = [f"{row['steps'] / self._bar.total:.0%} of {self._bar.total:,} steps"]
+            words += [f"{row['steps_per_second']:,.0f} steps/s"]
+            words += [f"{name}={value}" for name, value in figures.items()]
+            print(f"{self._name}: {', '.join(words)}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Close the bar; its last state stays on the terminal."""
+        self._bar.close()
+
+
+def shown(
+    row: Mapping[str, float], limits: Mapping[str, float], measure: str = "mean"
+) -> dict[str, str]:
+    """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
+
+    Return and costs are means over the episodes that ended in the epoch. While an algorithm lowers
+    its limit, the word "target" precedes the present one.
+
+    Examples:
+        >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
+        >>> shown(row, {"cost": 25.0})
+        {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
+        >>> shown(row | {"estimate_cost": 31.0, "target_cost": 29.0}, {"cost": 25.0})["cost"]
+        '30.0/target 29'
+    """
+    if math.isnan(row["episode_return"]):
+        return {"episodes": "none has ended"}
+    figures = {"return": f"{row['episode_return']:.2f}"}
+    for key in list(limits) or ["cost"]:
+        value = measured(row, key, limits.get(key), measure)
+        figures[key] = f"{value:.1f}{_present_limit(row, key, limits)}"
+    multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
+    if multipliers:
+        figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
+    return figures
+
+
+def _present_limit(row: Mapping[str, float], key: str, limits: Mapping[str, float]) -> str:
+    """The present limit of a cost, to follow its figure."""
+    if key not in limits:
+        return ""
+    target, limit = row.get(f"target_{key}", -math.inf), limits[key]
+    if target <= limit:
+        return f"/{limit:g}"
+    if target > row.get(f"estimate_{key}", math.inf):
+        return " (no limit yet)"
+    return f"/target {target:.3g}"
