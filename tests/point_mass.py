@@ -117,3 +117,10 @@ class Forgetful(PointMass):
 
     def get_state(self) -> None:  # type: ignore[override]
         return None
+
+
+class PricedPointMass(PointMass):
+    """An episode has 20 steps, each of which costs at most 1."""
+
+    def highest_cost(self, key):
+        return 20.0

@@ -88,8 +88,7 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     )
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
     about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra))}
-    if source.code:
-        about["commit"] = source.code[-1]["commit"]
+    about["commit"] = source.commit
     # first: an export that was killed can be repeated into its folder
     folder.mkdir(parents=True, exist_ok=True)
     replace_json(folder / "policy.json", about)
@@ -205,7 +204,7 @@ def _about(run: Run, env: EnvBase, checkpoint: Path, *, sampled: bool) -> dict[s
         "cost_limits": OmegaConf.to_container(config.cost_limits, resolve=True),
         "algorithm": run.algorithm,
         "steps": checkpoint_steps(checkpoint),
-        "commit": run.code[-1]["commit"] if run.code else None,
+        "commit": run.commit,
         "certificate": certificate and {key: certificate.get(key) for key in kept},
         "actions": "sampled" if sampled else "mean",
     }

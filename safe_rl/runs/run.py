@@ -313,9 +313,12 @@ class Run:
         return content
 
     @property
-    def code(self) -> list[dict[str, Any]] | None:
-        """The versions of the code that it used, with their first steps; None if not recorded."""
-        return read_json(self.code_file) if self.code_file.is_file() else None
+    def commit(self) -> Any:
+        """The commit of the code that used it last; None if it is not known."""
+        try:
+            return read_json(self.code_file)[-1]["commit"]
+        except (OSError, ValueError, TypeError, LookupError):
+            return None  # there is no such file, or it is damaged
 
 
 def find_runs(root: Path, most: int | None = None) -> list[Run]:

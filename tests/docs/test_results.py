@@ -150,5 +150,7 @@ def test_coverage_counts_the_seeds_of_finished_runs():
 
 def test_every_environment_has_results_as_readme_says():
     rows = results.coverage().splitlines()[2:]
-    assert len(rows) == 18
-    assert all("×" in row for row in rows)
+    runs = [sum(map(int, re.findall(r"(\d+) ×", row))) for row in rows]
+    assert len(runs) == 18
+    assert min(runs) > 0
+    assert sum(number <= 3 for number in runs) == 13  # what README says

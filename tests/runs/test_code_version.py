@@ -8,6 +8,7 @@ import pytest
 import safe_rl
 from safe_rl.runs import code_version
 from safe_rl.runs.code_version import code_of, commit_of, note_code
+from safe_rl.runs.run import Run
 
 
 @pytest.fixture
@@ -77,5 +78,8 @@ def test_code_that_resumes_a_run_stands_below_what_began_it(tmp_path, monkeypatc
     assert noted("b", 200) == [(0, "a"), (200, "b")]
     # begun anew from an earlier checkpoint
     assert noted("c", 150) == [(0, "a"), (150, "c")]
-    path.write_text("damaged")
+    assert Run(tmp_path).commit == "c"
+    for damage in ("damaged", "[1.5]", "{}", "[]"):
+        path.write_text(damage)
+        assert Run(tmp_path).commit is None
     assert noted("d", 300) == [(300, "d")]
