@@ -6,7 +6,7 @@ This is directly in ``safe_rl/``, because several folders have such objects.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ class Resumable:
         {'sums': tensor([1.]), 'steps': 5}
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ()
+    state_names: tuple[str, ...] = ()
 
     def state_dict(self) -> Mapping[str, Any]:
         """Everything that an exact continuation needs, by name."""

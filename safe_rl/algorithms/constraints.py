@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Self
 
 import torch
 from omegaconf import DictConfig
@@ -77,11 +77,14 @@ class Constraints(Resumable):
         self.keys, values = parse_cost_limits(limits) if limits else ([], torch.empty(0))
         self.limits = values.to(device)
         self.tracker, self.risk = tracker, risk
+        self.state_names = ("finished", "mean_length") if tracker is None else ("tracker",)
+        if risk is not None:
+            self.state_names = ("tracker", "risk")
         self.schedule = tracker.schedule if tracker is not None and self.keys else ""
         self._max_length = max_length
         # mean costs and length of episodes in the last batch in which an episode finished
-        self._finished = torch.full_like(self.limits, torch.nan)
-        self._mean_length = torch.full((), torch.nan, device=device)
+        self.finished = torch.full_like(self.limits, torch.nan)
+        self.mean_length = torch.full((), torch.nan, device=device)
         self._penalised: PenalisedCosts | None = None
 
     @classmethod
@@ -153,9 +156,9 @@ class Constraints(Resumable):
         rate times the length.
         """
         if episodes.num_episodes:
-            self._finished = episodes.mean_costs(self.keys).to(self._finished)
-            self._mean_length = episodes.decisions.mean().to(self._mean_length)
-        costs, length = self._finished, self._mean_length
+            self.finished = episodes.mean_costs(self.keys).to(self.finished)
+            self.mean_length = episodes.decisions.mean().to(self.mean_length)
+        costs, length = self.finished, self.mean_length
         has_finished = bool(length.isfinite())
         if not has_finished:
             length = torch.full_like(length, float(self._max_length or batch.shape[-1]))
@@ -218,23 +221,6 @@ class Constraints(Resumable):
             )
         names = map(key_name, self.keys)
         return {f"{name}_{key}": v for key, v in zip(names, value.tolist(), strict=True)}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Tracker and risk measure, or the episodes of the last batch."""
-        if self.tracker is None:
-            return {"finished": self._finished.clone(), "mean_length": self._mean_length.clone()}
-        risk = {} if self.risk is None else {"risk": self.risk.state_dict()}
-        return {"tracker": self.tracker.state_dict()} | risk
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        if self.tracker is None:
-            self._finished = state_dict["finished"].to(self._finished)
-            self._mean_length = state_dict["mean_length"].to(self._mean_length)
-            return
-        self.tracker.load_state_dict(state_dict["tracker"])
-        if self.risk is not None:
-            self.risk.load_state_dict(state_dict["risk"])
 
 
 def check_cost_limits(

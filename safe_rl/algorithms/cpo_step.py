@@ -13,9 +13,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, known
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
-from safe_rl.objectives.trust_region import flat_gradient
+from safe_rl.objectives.limits import LimitState
+from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
 
 #: Squared norm of a cost gradient below which a satisfied constraint is left out (case 4).
 _NO_GRADIENT = 1e-8
@@ -69,16 +70,18 @@ class CPOStep(TRPOStep):
         self.rescale_violation = rescale_violation
         self.largest_required_decrease = largest_required_decrease
 
-    def _propose(self, problem: StepProblem) -> Proposal:
-        g, b, c = self._linearised(problem)
+    def _propose(
+        self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
+    ) -> Proposal:
+        g, b, c = self._linearised(losses, known(limits))
         # With its gradient set to 0, the dual leaves out a satisfied constraint (case 4).
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
-        v, w = self._solve_all(problem.fisher, g, b)
+        v, w = self._solve_all(fisher, g, b)
         q, r, s = g @ v, w @ g, b @ w.T
         c = self._bounded(c, s.diagonal())
         dual = solve_dual(q, r, s, c, self.target_kl)
         step = -(dual.reward_coefficient * v + dual.cost_coefficient @ w)
-        accepts = self._acceptance(problem.losses, c, may_be_worse=dual.case < 2)
+        accepts = self._acceptance(losses, c, may_be_worse=dual.case < 2)
         return Proposal(step, accepts, self._diagnostics(q, r, s.diagonal(), c, dual))
 
     def _bounded(self, c: Tensor, s: Tensor) -> Tensor:
@@ -103,14 +106,16 @@ class CPOStep(TRPOStep):
 
         return is_acceptable
 
-    def _linearised(self, problem: StepProblem) -> tuple[Tensor, Tensor, Tensor]:
+    def _linearised(
+        self, losses: TensorDictBase, limits: LimitState
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
-        c = problem.required_decrease
+        surrogates = losses["cost_surrogate"]
+        c = limits.required_decrease_for(surrogates)
         if self.rescale_violation:
-            c = c / problem.length
-        loss = finite_sum(problem.losses)
-        g = flat_gradient(loss, self.parameters, retain_graph=True)
-        return g, self._gradients(problem.surrogates), c
+            c = c / limits.length_for(surrogates)
+        g = flat_gradient(finite_sum(losses), self.parameters, retain_graph=True)
+        return g, self._gradients(surrogates), c
 
     def _diagnostics(
         self, q: Tensor, r: Tensor, s: Tensor, c: Tensor, dual: DualSolution
@@ -205,15 +210,17 @@ class PCPOStep(CPOStep):
         super().__init__(loss, **settings)
         self.projection = projection
 
-    def _propose(self, problem: StepProblem) -> Proposal:
-        g, b, c = self._linearised(problem)
-        v, w = self._solve_all(problem.fisher, g, b)
+    def _propose(
+        self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
+    ) -> Proposal:
+        g, b, c = self._linearised(losses, known(limits))
+        v, w = self._solve_all(fisher, g, b)
         c = self._bounded(c, (b * w).sum(-1))
         for_reward = self._longest(v, g)
         back = w if self.projection == "kl" else b
         nu = nearest_feasible(c + b @ for_reward, b @ back.T)
         step = for_reward - nu @ back
-        length = step @ problem.fisher(step)
+        length = step @ fisher(step)
         shortened = (2 * self.target_kl / length.clamp_min(1e-30)).sqrt().clamp_max(1.0)
-        accepts = self._acceptance(problem.losses, c, may_be_worse=nu.any())
+        accepts = self._acceptance(losses, c, may_be_worse=nu.any())
         return Proposal(shortened * step, accepts, {"c": c, "nu": nu, "shortened": shortened})

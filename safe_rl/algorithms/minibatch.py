@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from annotated_types import Interval
@@ -127,7 +127,7 @@ class MinibatchUpdate(PolicyUpdate):
         tensor(8)
     """
 
-    state_names: ClassVar[tuple[str, ...]] = ("optimizer", "_generator")
+    state_names: tuple[str, ...] = ("optimizer", "_generator")
 
     def __init__(
         self,

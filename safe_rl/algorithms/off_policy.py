@@ -118,7 +118,6 @@ class OffPolicy(Resumable, Algorithm):
             reward_keys=["reward", *constraints.keys],
             reward_gamma=config.loss.get("gamma", 1.0),
             device=device,
-            example=env.fake_tensordict(),
             **others,
         )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
@@ -172,15 +171,7 @@ class OffPolicy(Resumable, Algorithm):
         )
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
-        """Store a batch [N, T] and take the gradient steps that are due on the replay buffer.
-
-        Args:
-            batch: Steps of the current policy, in order of time.
-            episodes: Statistics of the episodes in the batch.
-
-        Returns:
-            Values for columns of the table, by name.
-        """
+        """Store a batch and take the gradient steps that are due; see `Algorithm.learn`."""
         constraints, multiplier = self.constraints, self.multiplier
         row: dict[str, float] = {}
         if constraints.keys:

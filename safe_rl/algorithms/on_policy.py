@@ -25,10 +25,15 @@ from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import build_networks, make_behaviour, take_in
-from safe_rl.objectives import CriticLoss, LimitState, Multiplier
-from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives import (
+    CostGAE,
+    CriticLoss,
+    JointAdvantages,
+    LimitState,
+    Multiplier,
+    VectorGAE,
+)
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.trust import instantiate
 
 
@@ -123,25 +128,12 @@ class OnPolicy(Algorithm):
         return make_behaviour(actor), {"actor": actor}
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
-        """Train on one batch.
-
-        Args:
-            batch: Rollouts of the current policy, [N, T]; advantages are written into it.
-            episodes: Statistics of the episodes in the batch.
-
-        Returns:
-            Values for columns of the table, by name.
-        """
+        """Train on one batch, into which advantages are written; see `Algorithm.learn`."""
         constraints, multiplier = self.constraints, self.multiplier
         limits = constraints.update(batch, episodes)
         if multiplier is not None:
             multiplier.update(limits)
-        self.advantage(batch)
-        keys = {"advantage": self.advantage.tensor_keys.advantage}
-        if self.cost_advantage is not None:
-            self.cost_advantage(batch)
-            keys["cost_advantage"] = self.cost_advantage.tensor_keys.advantage
-        normalise_advantages(batch, **keys)
+        JointAdvantages(self.advantage, self.cost_advantage)(batch)
         bias = self._critic_bias(batch)
         metrics = self._update(batch, limits)
         constraints.record_prediction(limits, metrics["policy"])

@@ -10,10 +10,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, StepProblem, TRPOStep
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, known
 from safe_rl.checks import Fraction
+from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
-from safe_rl.objectives.trust_region import flat_gradient
+from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
 
 
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
@@ -103,9 +104,12 @@ class CTRPOStep(TRPOStep):
         self.recovered = -(1 - hysteresis) * self.limits
         self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
 
-    def _propose(self, problem: StepProblem) -> Proposal:
-        surrogates, length = problem.surrogates, problem.length
-        violation = problem.required_decrease
+    def _propose(
+        self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
+    ) -> Proposal:
+        surrogates, state = losses["cost_surrogate"], known(limits)
+        length = state.length_for(surrogates)
+        violation = state.required_decrease_for(surrogates)
         is_above = violation >= self.recovered.to(violation)
         was_recovering = self.recovering.to(violation.device) & is_above
         costs_anything = violation > -self.limits.to(violation)
@@ -115,10 +119,10 @@ class CTRPOStep(TRPOStep):
         worst = int(violation.masked_fill(~self.recovering, -torch.inf).argmax())
         recovers = self.recovering.any()
         objective = (lambda of: of["cost_surrogate"][worst]) if recovers else finite_sum
-        loss = objective(problem.losses)
+        loss = objective(losses)
         g = flat_gradient(loss, self.parameters, retain_graph=True)
         b = self._gradients(surrogates[inside])
-        v, w = self._solve_all(problem.fisher, g, b)
+        v, w = self._solve_all(fisher, g, b)
         # Woodbury's identity for the inverse of H + Σ κᵢbᵢbᵢᵀ, whatever the size of κ
         root = (self.beta * length**2 / slack).sqrt()
         gram = torch.eye(len(root), dtype=root.dtype, device=root.device)
@@ -170,13 +174,17 @@ class CRPOStep(TRPOStep):
         super().__init__(loss, **settings)
         self.tolerance = tolerance
 
-    def _propose(self, problem: StepProblem) -> Proposal:
-        excess = problem.required_decrease - self.tolerance
+    def _propose(
+        self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
+    ) -> Proposal:
+        excess = known(limits).required_decrease_for(losses["cost_surrogate"]) - self.tolerance
         worst = int(excess.argmax())
         reduces = torch.zeros_like(excess)
         if excess[worst] > 0:
             reduces[worst] = 1.0
-            proposal = self._natural_step(problem, lambda of: of["cost_surrogate"][worst])
+            proposal = self._natural_step(
+                losses, fisher, lambda after: after["cost_surrogate"][worst]
+            )
         else:
-            proposal = super()._propose(problem)
+            proposal = super()._propose(losses, fisher, limits)
         return proposal._replace(diagnostics={**proposal.diagnostics, "reduces": reduces})

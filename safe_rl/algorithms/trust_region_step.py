@@ -37,42 +37,14 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
 
 
-class StepProblem(NamedTuple):
-    """The quantities from which a step is computed.
-
-    Attributes:
-        losses: Outputs of the loss before the step, with gradients.
-        fisher: Product with the Fisher matrix of the policy, plus damping.
-        limits: State of the limits, if the caller gives it.
-    """
-
-    losses: TensorDictBase
-    fisher: FisherProduct
-    limits: LimitState | None
-
-    @property
-    def surrogates(self) -> Tensor:
-        """The differentiable cost surrogates, [k]."""
-        return self.losses["cost_surrogate"]
-
-    @property
-    def required_decrease(self) -> Tensor:
-        """Decrease of J_c that each surrogate has to predict, [k]: J_c − d without a tracker."""
-        return self._known_limits.required_decrease_for(self.surrogates)
-
-    @property
-    def length(self) -> Tensor:
-        """T̄, scalar."""
-        return self._known_limits.length_for(self.surrogates)
-
-    @property
-    def _known_limits(self) -> LimitState:
-        if self.limits is None:
-            raise ValueError(
-                "A constrained step needs the state of the limits: pass what "
-                "Constraints.update(batch, episodes) returns, step(batch, limits)."
-            )
-        return self.limits
+def known(limits: LimitState | None) -> LimitState:
+    """The state of the limits, which a constrained step cannot do without."""
+    if limits is None:
+        raise ValueError(
+            "A constrained step needs the state of the limits: pass what "
+            "Constraints.update(batch, episodes) returns, step(batch, limits)."
+        )
+    return limits
 
 
 class Proposal(NamedTuple):
@@ -173,9 +145,8 @@ class TRPOStep(PolicyUpdate):
         losses = self.loss(batch)
         sample = subsample(batch, self.fisher_subsample)
         fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
-        problem = StepProblem(losses, fisher, limits)
-        proposal = self._propose(problem)
-        del fisher, problem
+        proposal = self._propose(losses, fisher, limits)
+        del fisher
         if not proposal.step.isfinite().all():
             raise FloatingPointError(
                 "The step of the policy is not finite, although the batch is; no parameter has "
@@ -185,16 +156,22 @@ class TRPOStep(PolicyUpdate):
         metrics = self._search(batch, reference, proposal)
         return metrics | proposal.diagnostics
 
-    def _propose(self, problem: StepProblem) -> Proposal:
-        return self._natural_step(problem, finite_sum)
+    def _propose(
+        self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
+    ) -> Proposal:
+        """Compute a step from the differentiable losses before it and the damped Fisher matrix."""
+        return self._natural_step(losses, fisher, finite_sum)
 
     def _natural_step(
-        self, problem: StepProblem, objective: Callable[[TensorDictBase], Tensor]
+        self,
+        losses: TensorDictBase,
+        fisher: FisherProduct,
+        objective: Callable[[TensorDictBase], Tensor],
     ) -> Proposal:
         """The longest step, within the trust region, down the natural gradient of an objective."""
-        loss = objective(problem.losses)
+        loss = objective(losses)
         gradient = flat_gradient(loss, self.parameters)
-        direction, _ = conjugate_gradient(problem.fisher, gradient, self.cg_iterations)
+        direction, _ = conjugate_gradient(fisher, gradient, self.cg_iterations)
         step, before = self._longest(direction, gradient), loss.detach()
         return Proposal(step, lambda after, kl: bool(objective(after) <= before), {})
 

@@ -168,15 +168,8 @@ class CostCritics(QFunctionLoss):
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
             discount = discount_of(tensordict, self.cost_gamma, spanned) * terminated.logical_not()
         predicted = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
-        loss = self.cost_errors(predicted, costs, discount, values).sum(-1).sum(0)
-        return self._mean(loss, tensordict)
-
-    def cost_errors(
-        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor
-    ) -> Tensor:
-        """Distances of the critics from their TD(0) targets, [E, ..., k]; see `CostValues`."""
-        given = values, costs, discount, following
-        return self.cost_values.errors(*given, self.bounded, self.loss_function)
+        errors = self.cost_values.errors(predicted, costs, discount, values, self.bounded)
+        return self._mean(errors.sum(-1).sum(0), tensordict)
 
     def bounded(self, values: Tensor) -> Tensor:
         """Costs to bootstrap on, from those of the E target networks, [E, ...]."""
@@ -199,7 +192,10 @@ class CostCritics(QFunctionLoss):
         weights = self.cost_weights(samples).to(values)
         penalty = self.reward_unit * (self.cost_of(values) @ weights)
         objective = (objective + penalty) / (1 + weights.sum())
-        reported = {**self.cost_figures(samples), "cost_weight": weights}
+        figures = {"cost_qvalue": self.cost_values.mean(samples)}
+        figures |= self.cost_values.figures(samples)
+        reported = {name: each.flatten(0, -2).mean(0) for name, each in figures.items()}
+        reported["cost_weight"] = weights
         return objective, {name: x for name, x in reported.items() if name in self.out_keys}
 
     def cost_of(self, values: Tensor) -> Tensor:
@@ -209,11 +205,6 @@ class CostCritics(QFunctionLoss):
     def cost_weights(self, values: Tensor) -> Tensor:
         """Weights of the costs in the actor's loss, [k]: λ / u."""
         return self.multiplier.value.to(self.cost_unit) / self.cost_unit
-
-    def cost_figures(self, values: Tensor) -> dict[str, Tensor]:
-        """Diagnostics of the critics' numbers [n, E, ..., k], [k] each."""
-        figures = {"cost_qvalue": self.cost_values.mean(values), **self.cost_values.figures(values)}
-        return {name: each.flatten(0, -2).mean(0) for name, each in figures.items()}
 
 
 def pessimistic(values: Tensor, deviations: float) -> Tensor:

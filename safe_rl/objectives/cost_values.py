@@ -16,8 +16,7 @@ import torch
 from annotated_types import Interval
 from pydantic import PositiveFloat
 from torch import Tensor
-from torch.nn.functional import softplus
-from torchrl.objectives.utils import distance_loss
+from torch.nn.functional import mse_loss, softplus
 
 from safe_rl.checks import Checked, Fraction
 from safe_rl.objectives.risk import CVaR
@@ -64,7 +63,6 @@ class CostValues(Checked, ABC):
         discount: Tensor,
         following: Tensor,
         bounded: Callable[[Tensor], Tensor],
-        distance: str,
     ) -> Tensor:
         """Distances of the numbers from their TD(0) targets, [E, ..., k].
 
@@ -74,7 +72,6 @@ class CostValues(Checked, ABC):
             discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
             following: Numbers of the target networks in the next state, [n, E, ..., k].
             bounded: Applies pessimism and bounds to costs [E, ...] to bootstrap on.
-            distance: Distance of a prediction from its target, as of `distance_loss`.
         """
 
     def figures(self, values: Tensor) -> dict[str, Tensor]:
@@ -101,11 +98,10 @@ class MeanCosts(CostValues):
         discount: Tensor,
         following: Tensor,
         bounded: Callable[[Tensor], Tensor],
-        distance: str,
     ) -> Tensor:
         """Distances of the means from c + γ Q'; see `CostValues`."""
         target = costs + discount * bounded(self.mean(following))
-        return distance_loss(self.mean(values), target, loss_function=distance)
+        return mse_loss(self.mean(values), target, reduction="none")
 
 
 def gaussian_tail(tail: float) -> float:
@@ -181,7 +177,6 @@ class GaussianCosts(CostValues):
         discount: Tensor,
         following: Tensor,
         bounded: Callable[[Tensor], Tensor],
-        distance: str,
     ) -> Tensor:
         """Squared 2-Wasserstein distances; see `CostValues`."""
         mean, variance = self.moments(values)
@@ -189,7 +184,7 @@ class GaussianCosts(CostValues):
         later = bounded(later_mean), later_variance
         target, spread = self.moment_targets(mean.detach(), costs, discount, later)
         distances = [
-            distance_loss(value, goal, loss_function=distance)
+            mse_loss(value, goal, reduction="none")
             for value, goal in ((mean, target), (variance.sqrt(), spread.sqrt()))
         ]
         return distances[0] + distances[1]
@@ -253,9 +248,8 @@ class QuantileCosts(CostValues):
         discount: Tensor,
         following: Tensor,
         bounded: Callable[[Tensor], Tensor],
-        distance: str,
     ) -> Tensor:
-        """Huber losses of the quantiles; see `CostValues`. `distance` is not used."""
+        """Huber losses of the quantiles; see `CostValues`."""
         later = bounded(following.movedim(0, -1))  # each quantile of its own
         targets = costs.unsqueeze(-1) + discount.unsqueeze(-1) * later
         change = targets.unsqueeze(-2) - values.movedim(0, -1).unsqueeze(-1)  # [E, ..., k, N, N]

@@ -7,14 +7,14 @@ from pydantic import NonNegativeFloat
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 from torchrl import objectives
 from torchrl.data import TensorSpec
 from torchrl.objectives import ValueEstimators
-from torchrl.objectives.utils import distance_loss
 
 from safe_rl.checks import Share
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import Distance, QFunctionLoss, ReplayLoss, check_ensemble
+from safe_rl.objectives.q_functions import QFunctionLoss, ReplayLoss, check_ensemble
 from safe_rl.objectives.samples import require
 
 
@@ -29,7 +29,6 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         policy_noise: Standard deviation of the noise on the target policy's actions, in units of
             half the range of actions.
         noise_clip: Bound of the noise on target actions, in units of half the range of actions.
-        loss_function: Loss of the TD errors.
 
     Examples:
         >>> from safe_rl.models import QEnsemble, make_bounded_actor
@@ -50,7 +49,6 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
         gamma: Share,
         policy_noise: NonNegativeFloat,
         noise_clip: NonNegativeFloat,
-        loss_function: Distance = "l2",
     ) -> None:
         check_ensemble(qvalue_network, "Q function of rewards")
         super().__init__(
@@ -60,7 +58,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             num_qvalue_nets=0,
             policy_noise=policy_noise,
             noise_clip=noise_clip,
-            loss_function=loss_function,
+            loss_function="l2",
         )
         self.gamma = gamma
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
@@ -95,16 +93,6 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             **reported,
         )
 
-    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The sum of `critic_losses`, and each of them, for scripts of TorchRL's TD3."""
-        losses = self.critic_losses(tensordict)
-        return sum(losses.values()), losses.detach().to_dict()
-
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss of `actor_losses`, and its other entries, for scripts of TorchRL's TD3."""
-        losses = self.actor_losses(tensordict).to_dict()
-        return losses.pop("loss_actor"), losses
-
 
 class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
@@ -134,14 +122,13 @@ class TD3LagrangianLoss(CostCritics, TD3Loss):
 
 
 class BCLoss(ReplayLoss):
-    """Behaviour cloning: distance of a deterministic policy's actions from recorded ones.
+    """Behaviour cloning: squared distance of a deterministic policy's actions from recorded ones.
 
     The loss reads neither costs nor rewards. If the steps are those of safe episodes, it is BC-Safe
     of Liu et al., *Datasets and Benchmarks for Offline Safe Reinforcement Learning* (2024).
 
     Args:
         actor_network: Deterministic policy, which writes the action alone.
-        loss_function: Distance between the policy's actions and the recorded ones.
 
     Raises:
         ValueError: If the policy writes more than the action, as a probabilistic one does.
@@ -162,9 +149,7 @@ class BCLoss(ReplayLoss):
     reduction = "mean"
     priority_key = None
 
-    def __init__(
-        self, actor_network: TensorDictModuleBase, *, loss_function: Distance = "l2"
-    ) -> None:
+    def __init__(self, actor_network: TensorDictModuleBase) -> None:
         super().__init__()
         if len(actor_network.out_keys) != 1:
             raise ValueError(
@@ -172,7 +157,6 @@ class BCLoss(ReplayLoss):
                 f"{actor_network.out_keys}."
             )
         self.convert_to_functional(actor_network, "actor_network")
-        self.loss_function = loss_function
         self.in_keys = [*actor_network.in_keys, *actor_network.out_keys]
         self.out_keys = ["loss_actor"]
 
@@ -188,5 +172,5 @@ class BCLoss(ReplayLoss):
         inputs = tensordict.select(*self.actor_network.in_keys)
         with self.actor_network_params.to_module(self.actor_network):
             chosen = self.actor_network(inputs).get(key)
-        error = distance_loss(chosen, taken, loss_function=self.loss_function)
+        error = mse_loss(chosen, taken, reduction="none")
         return TensorDict(loss_actor=self._reduce_loss(error, tensordict))

@@ -33,13 +33,6 @@ from torchrl.modules.distributions import has_analytic_entropy, has_analytic_kl
 from torchrl.modules.distributions.utils import sample_and_log_prob
 
 
-def gaussian_kl(loc_p: Tensor, scale_p: Tensor, loc_q: Tensor, scale_q: Tensor) -> Tensor:
-    """KL(p ‖ q) of diagonal Gaussians, in nats, summed over components: [..., n] -> [...]."""
-    ratio = (scale_p / scale_q).square()
-    shift = ((loc_p - loc_q) / scale_q).square()
-    return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
-
-
 def categorical_kl(p: Categorical, q: Categorical) -> Tensor:
     """KL(p ‖ q) of categorical distributions, [...], whose gradient is finite with masked choices.
 
@@ -118,11 +111,9 @@ def kl(
         return _composite_kl(p, q, batch)
     roots = root(p), root(q)
     if isinstance(roots[0], Normal) and isinstance(roots[1], Normal):
-        if not p.event_shape:
-            return kl_divergence(*roots)
-        divergence = gaussian_kl(roots[0].loc, roots[0].scale, roots[1].loc, roots[1].scale)
-        is_matrix = len(p.event_shape) > 1  # an action has more than one dimension
-        return divergence.flatten(len(p.batch_shape)).sum(-1) if is_matrix else divergence
+        divergence = kl_divergence(*roots)
+        # an action may have any number of dimensions
+        return divergence.flatten(len(p.batch_shape)).sum(-1) if p.event_shape else divergence
     if isinstance(p, Categorical) and isinstance(q, Categorical):
         return categorical_kl(p, q)
     if has_closed_kl(p) and has_analytic_kl(p, q):

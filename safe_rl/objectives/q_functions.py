@@ -9,8 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import dispatch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 from torchrl.objectives import LossModule
-from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator, ValueEstimatorBase
 
 from safe_rl.checks import Checked
@@ -43,10 +43,6 @@ def check_ensemble(network: Any, what: str) -> None:
         raise ValueError(
             f"The {what} has to be a safe_rl.models.QEnsemble, not a {type(network).__name__}."
         )
-
-
-Distance = Literal["l2", "smooth_l1", "l1"]
-"""Distance of a prediction from its target, see `torchrl.objectives.utils.distance_loss`."""
 
 
 class ReplayLoss(Checked, SharesTensors):
@@ -102,7 +98,6 @@ class QFunctionLoss(ReplayLoss):
     """
 
     gamma: float
-    loss_function: str
     qvalue_network: Ensemble
     _in_keys: list[NestedKey]
     # TorchRL's TD3 replaces this property by a list, with which `select_out_keys` fails
@@ -137,7 +132,7 @@ class QFunctionLoss(ReplayLoss):
         target = self._td_targets(tensordict)
         action = require(tensordict, keys.action)
         values = self.q_values("qvalue_network", tensordict, action).squeeze(-1)
-        errors = distance_loss(values, target.expand_as(values), loss_function=self.loss_function)
+        errors = mse_loss(values, target.expand_as(values), reduction="none")
         tensordict.set(keys.priority, (values.detach() - target).abs().max(0).values)
         return TensorDict(loss_qvalue=self._mean(errors.sum(0), tensordict))
 

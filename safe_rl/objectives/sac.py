@@ -17,7 +17,7 @@ from torchrl.objectives import ValueEstimators
 
 from safe_rl.checks import Share
 from safe_rl.objectives.cost_critics import CostCritics
-from safe_rl.objectives.q_functions import Distance, QFunctionLoss, check_ensemble
+from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble
 
 
 class SACLoss(QFunctionLoss, objectives.SACLoss):
@@ -30,8 +30,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         alpha_init: Initial entropy coefficient (temperature) α.
         target_entropy: Entropy of the policy that α is adapted to reach; ``"auto"`` is −A for
             actions [A].
-        fixed_alpha: Whether the entropy coefficient α is constant.
-        loss_function: Loss of the TD errors.
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
@@ -53,8 +51,6 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         gamma: Share,
         alpha_init: Annotated[float, Interval(ge=1e-9, le=1e9)],
         target_entropy: FiniteFloat | Literal["auto"] = "auto",
-        fixed_alpha: bool = False,
-        loss_function: Distance = "l2",
         action_spec: TensorSpec | None = None,
     ) -> None:
         check_ensemble(qvalue_network, "Q function of rewards")
@@ -62,10 +58,9 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             actor_network,
             qvalue_network,
             num_qvalue_nets=0,
-            loss_function=loss_function,
+            loss_function="l2",
             alpha_init=alpha_init,
             target_entropy=target_entropy,
-            fixed_alpha=fixed_alpha,
             action_spec=action_spec,
         )
         self.gamma = gamma

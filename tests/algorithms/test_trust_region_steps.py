@@ -16,10 +16,10 @@ from samples import (
     whole_step,
 )
 from tensordict import TensorDict
+from torch.distributions import Normal, kl_divergence
 
 from safe_rl.algorithms import CPOStep, TRPOStep
 from safe_rl.objectives import CPOLoss, LagrangeMultiplier, TRPOLagrangianLoss, TRPOLoss
-from safe_rl.objectives.distributions import gaussian_kl
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.trust_region import FisherProduct, conjugate_gradient, flatten, policy_in
 
@@ -47,7 +47,7 @@ def cpo_step(actor, **settings):
 def kl_and_surrogates(actor, batch):
     with torch.no_grad():
         policy = policy_in(actor, batch).base_dist
-        kl = gaussian_kl(policy.loc, policy.scale, batch["loc"], batch["scale"]).mean()
+        kl = kl_divergence(policy, Normal(batch["loc"], batch["scale"])).sum(-1).mean()
         reward = -TRPOLoss(actor, entropy_coeff=0.0)(batch)["loss_objective"]
         costs = None
         if "cost_advantage" in batch.keys():  # noqa: SIM118 (a TensorDict iterates over its rows)

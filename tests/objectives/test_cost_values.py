@@ -143,7 +143,8 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
     loss = make_loss(networks=4, target_pessimism=1.0, lowest_cost_value=lowest)
     numbers = torch.tensor([[5.0, 6.0, 1.0, 1.0], [1.0, 3.0, 1.0, 1.0]]).view(2, 4, 1, 1)
     found, following = (loss.cost_values.arranged(each, 1) for each in numbers)
-    errors = loss.cost_errors(found, torch.tensor([[6.0]]), torch.tensor([[0.5]]), following)
+    step = torch.tensor([[6.0]]), torch.tensor([[0.5]])
+    errors = loss.cost_values.errors(found, *step, following, loss.bounded)
     variance, target = np.log1p(np.e), 6.0 + 0.5 * later
     for mean, error in zip((5.0, 6.0), errors.flatten().tolist(), strict=True):
         wanted = target**2 + 0.25 * variance - mean**2
@@ -179,7 +180,7 @@ def test_the_quantile_loss_is_the_equation_of_its_article():
     values = QuantileCosts(number=3, tail=1.0, huber=0.5)
     found, following = torch.randn(2, 3, 2, 5, 2)
     costs, discount = torch.rand(5, 2), torch.full((5, 1), 0.9)
-    errors = values.errors(found, costs, discount, following, lambda x: x, "l2")
+    errors = values.errors(found, costs, discount, following, lambda x: x)
     expected = torch.zeros(2, 5, 2)
     for i, level in enumerate((1 / 6, 1 / 2, 5 / 6)):
         for j in range(3):
@@ -195,10 +196,12 @@ def test_quantiles_bootstrap_on_the_larger_of_two_and_never_below_the_bound():
     loss = make_loss(values=quantiles(2), **given)
     following = torch.tensor([[-1.0, -2.0], [3.0, 5.0]]).reshape(2, 2, 1, 1)
     target = torch.tensor([6.0, 8.5]).reshape(2, 1, 1, 1).expand(2, 2, 1, 1)  # 6 + ½ (0, 5)
-    step = torch.tensor([[6.0]]), torch.tensor([[0.5]])
-    found = loss.cost_errors(target, *step, following)
-    expected = loss.cost_errors(
-        target, *step, torch.tensor([0.0, 5.0]).reshape(2, 1, 1, 1).expand(2, 2, 1, 1)
-    )
-    torch.testing.assert_close(found, expected)
-    assert found.max() < loss.cost_errors(target + 1, *step, following).min()
+    within = torch.tensor([0.0, 5.0]).reshape(2, 1, 1, 1).expand(2, 2, 1, 1)
+
+    def errors(values, later):
+        step = torch.tensor([[6.0]]), torch.tensor([[0.5]])
+        return loss.cost_values.errors(values, *step, later, loss.bounded)
+
+    found = errors(target, following)
+    torch.testing.assert_close(found, errors(target, within))
+    assert found.max() < errors(target + 1, following).min()
