@@ -200,10 +200,8 @@ class MinibatchUpdate(PolicyUpdate):
 
     def _samples(self, batch: TensorDictBase) -> TensorDictBase:
         """Entries of a batch that the loss reads, without padding; refuses non-finite entries."""
-        selected = batch.select(*self.loss.in_keys)
-        others = [*mask_keys(self.loss), *estimates_read(self.loss)]
-        selected.update(batch.select(*others, strict=False))
-        return learning_samples(selected, self.loss.in_keys, self.loss)
+        keys = [*self.loss.in_keys, *mask_keys(self.loss), *estimates_read(self.loss)]
+        return learning_samples(batch.select(*keys, strict=False), self.loss.in_keys, self.loss)
 
     def _next_rate(self, share_of_steps: float, kl: Tensor) -> Tensor:
         """Adapt the learning rate after an update, if it took a step, and return the rate."""

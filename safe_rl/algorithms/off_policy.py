@@ -20,13 +20,7 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy, QEnsemble
-from safe_rl.models.encoders import (
-    Codes,
-    Observed,
-    check_encoders,
-    critic_entries,
-    observed_entries,
-)
+from safe_rl.models.encoders import Codes, Observed, observed_by, observed_entries
 from safe_rl.models.replay_networks import bounded_actions
 from safe_rl.objectives import CostValues, MeanCosts, Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss
@@ -108,18 +102,10 @@ class OffPolicy(Resumable, Algorithm):
         )
         update = instantiate(config.policy_update, loss=loss)
         _check_loss(config, constraints, loss)
-        cost_gamma = config.loss.get("cost_gamma")
-        others = (
-            {} if cost_gamma is None else {"gammas": dict.fromkeys(constraints.keys, cost_gamma)}
-        )
-        buffer = instantiate(
-            config.memory,
-            in_keys=loss.in_keys,
-            reward_keys=["reward", *constraints.keys],
-            reward_gamma=config.loss.get("gamma", 1.0),
-            device=device,
-            **others,
-        )
+        gammas = dict.fromkeys(["reward", *constraints.keys], config.loss.get("gamma", 1.0))
+        if (cost_gamma := config.loss.get("cost_gamma")) is not None:
+            gammas |= dict.fromkeys(constraints.keys, cost_gamma)
+        buffer = instantiate(config.memory, in_keys=loss.in_keys, gammas=gammas, device=device)
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
@@ -153,21 +139,17 @@ class OffPolicy(Resumable, Algorithm):
     @property
     def lost_on_resume(self) -> str:
         """A sentence on the state that a checkpoint does not have; empty if it has all of it."""
-        if self.replay_buffer.keeps:
+        buffer = self.replay_buffer
+        if buffer.keeps or not (self.collects or buffer.is_prioritised):
             return ""
+        lost, then = "transitions", f"resumes when it holds {self.random_steps:,} new ones, and "
         if not self.collects:
-            if not self.replay_buffer.is_prioritised:
-                return ""
-            return (
-                "The priorities of the transitions are not stored (memory.keep=false): learning "
-                "differs from a run that was not interrupted."
-            )
-        resumes = f"resumes when it holds {self.random_steps:,} new ones"
-        if len(self.replay_buffer):
-            resumes = "resumes with those of the dataset alone"
+            lost, then = "priorities", ""
+        elif len(buffer):
+            then = "resumes with those of the dataset alone, and "
         return (
-            "The transitions in its replay buffer are not stored (memory.keep=false): learning "
-            f"{resumes}, and differs from a run that was not interrupted."
+            f"The {lost} in its replay buffer are not stored (memory.keep=false): learning "
+            f"{then}differs from a run that was not interrupted."
         )
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
@@ -271,14 +253,8 @@ def build_networks(
 ) -> dict[str, Any]:
     """Build the actor and, unless their number in ``critics`` is 0, critics of reward and costs.
 
-    Args:
-        config: Configuration as composed from ``conf/``.
-        env: Environment whose specs have the sizes of observations and actions.
-        num_costs: Number of constrained costs; 0: no cost critics.
-        device: Device of the parameters.
-        cost_values: What the cost critics return; by default the mean.
-        critic_observes: Entries that critics read; by default the observation. In evaluation the
-            environment may not have them.
+    Critics read the entries `critic_observes`, by default the observation; in evaluation the
+    environment may not have others. Cost critics return what `cost_values` says, by default means.
 
     Raises:
         ValueError: If actions have no bounds, the model does not fit the observation or is for
@@ -296,16 +272,13 @@ def build_networks(
             "model=mlp, model=cnn or model=dict without it."
         )
     common: dict[str, Any] = {"hidden_sizes": list(model.hidden_sizes), "device": device}
-    entries = observed_entries(env.observation_spec)
     layouts = {"observation": env.observation_layout, "privileged": env.privileged_layout}
-    encoders = model.get("encoders")
-    seen = Observed(entries, layouts, model.input_scale, clip=None, encoders=encoders)
-    check_encoders(seen)
+    seen = observed_by(model, env.observation_spec, layouts)
     bounds = {"low": spec.low, "high": spec.high}
     networks = {"actor": instantiate(config.actor, **_inputs(seen, device), **bounds, **common)}
     common["action_size"] = len(spec.low)
     if critic_observes:
-        seen = seen._replace(entries=critic_entries(critic_observes, env.observation_spec))
+        seen = seen._replace(entries=observed_entries(env.observation_spec, critic_observes))
     if number := config.critics.rewards:
         inputs = _inputs(seen, device, "action")
         networks["critic"] = QEnsemble(num_networks=number, **inputs, **common)

@@ -75,10 +75,6 @@ class OnPolicy(Algorithm):
     def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
         """Build networks, estimators, losses and updates.
 
-        Args:
-            config: Configuration as composed from ``conf/``.
-            env: Environment that keeps the contract of `safe_rl.envs`.
-
         Raises:
             ValueError: If a cost limit names a cost that the environment does not have, or a
                 constrained algorithm gets no limit.

@@ -20,15 +20,9 @@ from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
 def barrier_divergence(change: Tensor, slack: Tensor) -> Tensor:
     """Bregman divergence, for x log x, between two distances of a cost to its limit.
 
-    D(s − a, s) = a + (s − a) log((s − a)/s). At a = 0, its value and its slope are 0 and its
-    curvature is 1/s. Beyond the limit it is infinite.
-
-    Args:
-        change: Increase a of the cost, any shape.
-        slack: Distance s > 0 of the cost to its limit before the increase, of the same shape.
-
-    Returns:
-        The divergence, of this shape.
+    D(s − a, s) = a + (s − a) log((s − a)/s), where a is the change of the cost, and s > 0 the slack
+    before it. At a = 0, its value and its slope are 0 and its curvature is 1/s. Beyond the limit it
+    is infinite.
 
     Examples:
         >>> barrier_divergence(torch.tensor([0.0, 5.0, 15.0]), torch.tensor([10.0, 10.0, 10.0]))

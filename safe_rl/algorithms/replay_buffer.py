@@ -38,9 +38,7 @@ class Memory(Checked):
         capacity: Largest number of transitions; the oldest are overwritten first.
         batch_size: Transitions in a minibatch.
         in_keys: Entries of a step that are stored.
-        reward_keys: Entries below ``next`` that are summed over n steps.
-        reward_gamma: Discount per step of these sums.
-        gammas: Discounts of some of them, which replace ``reward_gamma``, by entry.
+        gammas: Entry below ``next`` that is summed over n steps -> discount per step.
         n_steps: Number n of steps that a transition spans (n-step returns).
         prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
@@ -57,7 +55,7 @@ class Memory(Checked):
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
-        ...     reward_keys=["reward"], reward_gamma=0.99, n_steps=1, keep=True,
+        ...     gammas={"reward": 0.99}, n_steps=1, keep=True,
         ... )
         >>> step = {"reward": torch.ones(2, 5, 1), "done": torch.zeros(2, 5, 1, dtype=torch.bool)}
         >>> batch = TensorDict(observation=torch.zeros(2, 5, 3), next=step, batch_size=[2, 5])
@@ -72,9 +70,7 @@ class Memory(Checked):
         capacity: Annotated[int, Interval(ge=1, le=10**8)],
         batch_size: PositiveInt,
         in_keys: Sequence[NestedKey],
-        reward_keys: Sequence[NestedKey],
-        reward_gamma: float,
-        gammas: Mapping[NestedKey, float] | None = None,
+        gammas: Mapping[NestedKey, float],
         n_steps: Annotated[int, Interval(ge=1, le=1000)],
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
@@ -88,8 +84,8 @@ class Memory(Checked):
             sampler=_sampler(capacity, prioritised),
         )
         keys_of: dict[float, list[NestedKey]] = {}
-        for key in reward_keys if n_steps > 1 else ():
-            keys_of.setdefault((gammas or {}).get(key, reward_gamma), []).append(key)
+        for key, gamma in gammas.items() if n_steps > 1 else ():
+            keys_of.setdefault(gamma, []).append(key)
         # its default done_keys keep `terminated` of the first step, so that values would be
         # bootstrapped beyond an end within the n steps
         self._n_step_transforms = [
@@ -104,23 +100,25 @@ class Memory(Checked):
 
     def extend(self, batch: TensorDictBase) -> None:
         """Add the steps [N, T] that follow those of the last call."""
-        self._add(self._summed(batch) if self._n_step_transforms else [batch])
-
-    def _add(self, pieces: list[TensorDictBase]) -> None:
-        if not pieces:  # fewer than n steps so far
+        if not self._n_step_transforms:
+            self._add([batch])
             return
-        pieces = [piece.select(*self.in_keys, *self._spanned) for piece in pieces]
-        steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
-        self._buffer.extend(steps.reshape(-1))
-
-    def _summed(self, batch: TensorDictBase) -> list[TensorDictBase]:
-        """Transitions over n steps, piece by piece; the transforms remember earlier steps."""
         wanted = batch.select(*{("next", "done"), *self.in_keys})
-        pieces = [self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)]
-        return [piece for piece in pieces if piece is not None]
+        self._add([self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)])
+
+    def _add(self, given: list[TensorDictBase | None]) -> None:
+        pieces = [
+            piece.select(*self.in_keys, *self._spanned) for piece in given if piece is not None
+        ]
+        if pieces:  # there may be fewer than n steps so far
+            steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
+            self._buffer.extend(steps.reshape(-1))
 
     def _over_steps(self, piece: TensorDictBase) -> TensorDictBase | None:
-        """Transitions over n steps; None if there are fewer than n steps so far."""
+        """Transitions over n steps; None if there are fewer than n steps so far.
+
+        The transforms remember the steps whose sums are not complete.
+        """
         first, *others = self._n_step_transforms
         transitions: TensorDictBase | None = first.inv(piece)
         for transform in others:
@@ -138,7 +136,7 @@ class Memory(Checked):
         waiting["next", "done"][..., -1, :] = True
         self._wait_with(waiting)
         beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._n_step_transforms[0].n_steps)
-        self._add([piece for piece in [self._over_steps(beyond)] if piece is not None])
+        self._add([self._over_steps(beyond)])
         self._wait_with(None)
 
     def _wait_with(self, steps: TensorDictBase | None) -> None:
@@ -158,10 +156,10 @@ class Memory(Checked):
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
             yield from drawn.split(self.batch_size)
 
-    def learned(self, minibatch: TensorDictBase, priority: NestedKey | None = "td_error") -> None:
-        """Set the priorities of a minibatch by the TD errors that a loss has written into it."""
+    def set_priorities(self, minibatch: TensorDictBase, errors: Tensor) -> None:
+        """Set the priorities of the transitions of a minibatch [B] by their TD errors [B]."""
         if self.is_prioritised:
-            self._buffer.update_priority(minibatch["index"], minibatch[priority])
+            self._buffer.update_priority(minibatch["index"], errors)
 
     def state_dict(self) -> dict[str, Any]:
         """The transitions, the position of the next one, and the state of n-step sums."""

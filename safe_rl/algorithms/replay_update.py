@@ -156,8 +156,7 @@ class ReplayUpdate(Checked):
                 raise
             self._counts["updates"] += 1
             if priority is not None:
-                key = self.loss.priority_key
-                buffer.learned(minibatch.set(key, priority), key)
+                buffer.set_priorities(minibatch, priority)
             sums += values
             reported = self._reported[with_actor]
             counts = {name: count + (name in reported) for name, count in counts.items()}

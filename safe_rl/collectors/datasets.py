@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
 
 from safe_rl.collectors.recording import PARTIAL, read_interface, read_recording
 from safe_rl.extras import import_extra
@@ -114,18 +115,19 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
         >>> safe_episodes(steps, {"cost": 1.0}).shape  # the second episode of three
         torch.Size([1, 2])
     """
-    done = steps["next", "done"].squeeze(-1).long()
-    episode = done.cumsum(-1) - done
-    number = int(episode.max()) + 1
-    is_kept = torch.zeros(done.shape[0], number).scatter_add_(1, episode, done.float()) > 0
+    ends = steps["next", "done"].squeeze(-1).long()
+    episode = ends.cumsum(-1) - ends
+
+    def sums(values: Tensor) -> Tensor:
+        """Sums over each episode of every row, [N, number of episodes]."""
+        zeros = torch.zeros(len(ends), int(episode.max()) + 1, dtype=torch.float64)
+        return zeros.scatter_add_(1, episode, values.squeeze(-1).double())
+
+    is_kept = sums(steps["next", "done"]) > 0
     if (partial := steps.get(PARTIAL, None)) is not None:
-        parts = torch.zeros(done.shape[0], number)
-        is_kept = is_kept & (parts.scatter_add_(1, episode, partial.squeeze(-1).float()) == 0)
+        is_kept &= sums(partial) == 0
     for key, limit in limits.items():
-        cost = steps["next", key].squeeze(-1).double()
-        total = torch.zeros(done.shape[0], number, dtype=torch.float64)
-        total.scatter_add_(1, episode, cost)
-        is_kept = is_kept & (total <= limit * (1 + _ROUNDING))
+        is_kept &= sums(steps["next", key]) <= limit * (1 + _ROUNDING)
     return steps.reshape(1, -1)[:, is_kept.gather(1, episode).reshape(-1)]
 
 

@@ -16,8 +16,7 @@ from safe_rl.models.encoders import (
     Body,
     Observed,
     RecurrentLayer,
-    check_encoders,
-    critic_entries,
+    observed_by,
     observed_entries,
 )
 from safe_rl.models.heads import AUTO, Head, make_head
@@ -54,13 +53,10 @@ def build_networks(
     Raises:
         ValueError: If the configuration does not fit the environment.
     """
-    entries, normalise = observed_entries(observation_spec), model.get("normalise")
-    encoders = model.get("encoders")
     layouts = {"observation": layout, "privileged": privileged_layout or {}}
-    observed = Observed(entries, layouts, model["input_scale"], clip=normalise, encoders=encoders)
-    chosen = list(model.get("critic_observes") or ["observation"])
-    read = entries if chosen == ["observation"] else critic_entries(chosen, observation_spec)
-    check_encoders(observed)
+    observed = observed_by(model, observation_spec, layouts)
+    read = model.get("critic_observes") or ["observation"]
+    seen = observed._replace(entries=observed_entries(observation_spec, read))
     widths = list(model["hidden_sizes"])
     recurrent_size = model["memory"]["size"] if model.get("memory") else 0
     if recurrent_size and RECURRENT not in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
@@ -71,8 +67,6 @@ def build_networks(
     kind, log_std = model.get("head") or AUTO, model["initial_log_std"]
     head = make_head(kind, action_spec, initial_log_std=log_std, device=device)
     actor = _actor(observed, head, widths, recurrent_size, device)
-
-    seen = observed._replace(entries=read)
 
     def critic(num_outputs: int, out_key: str) -> TensorDictModule:
         body = _body(seen, num_outputs, widths, recurrent_size, device)

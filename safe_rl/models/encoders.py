@@ -20,11 +20,6 @@ from safe_rl.models.networks import (
     perceptron,
 )
 
-TO_FLATTEN = (
-    "make the environment flatten them: with env.observation_flatten=true in Safety Gym, else with "
-    "env.flatten=true"
-)
-
 
 class Entry(NamedTuple):
     """A tensor that is observed.
@@ -45,37 +40,26 @@ class Entry(NamedTuple):
         return f"{self.name} {list(self.shape)}"
 
 
-def observed_entries(observation_spec: Composite) -> list[Entry]:
-    """Return all entries of ``observation``, in alphabetical order of their names.
+def observed_entries(spec: Composite, names: Sequence[str] = ("observation",)) -> list[Entry]:
+    """Return the entries with these names; those of a dictionary in alphabetical order.
 
     Raises:
-        ValueError: If an entry is neither a vector nor a picture.
-    """
-    observed = observation_spec["observation"]
-    if not isinstance(observed, Composite):
-        return [_entry("observation", "observation", observed)]
-    names = sorted(map(str, observed.keys()))
-    return [_entry(("observation", name), name, observed[name]) for name in names]
-
-
-def critic_entries(chosen: Sequence[str], observation_spec: Composite) -> list[Entry]:
-    """Return the entries that critics read by ``model.critic_observes``.
-
-    Raises:
-        ValueError: If the environment does not write an entry.
+        ValueError: If the environment does not write an entry, or it is neither a vector nor a
+            picture.
     """
     entries: list[Entry] = []
-    for name in chosen:
-        if name == "observation":
-            entries += observed_entries(observation_spec)
-        elif name in observation_spec.keys():  # noqa: SIM118, a spec is no mapping
-            entries.append(_entry(name, name, observation_spec[name]))
-        else:
+    for name in names:
+        if name not in spec.keys():  # noqa: SIM118, a spec is no mapping
             raise ValueError(
                 f"model.critic_observes: this environment writes no '{name}'. Set "
                 "env.observe_privileged=true in Safety Gym, or name an entry with env=gymnasium "
                 "and env=torchrl: env.privileged=…"
             )
+        if isinstance(spec[name], Composite):
+            below = sorted(map(str, spec[name].keys()))
+            entries += [_entry((name, part), part, spec[name][part]) for part in below]
+        else:
+            entries.append(_entry(name, name, spec[name]))
     return entries
 
 
@@ -129,13 +113,16 @@ class Observed(NamedTuple):
         return torch.cat([torch.ones(n) if scale is None else scale for scale, n in parts])
 
 
-def check_encoders(observed: Observed) -> None:
-    """Refuse dictionaries and pictures without encoders, and encoders of pictures without any.
+def observed_by(
+    model: Mapping[str, Any], spec: Composite, layouts: Mapping[str, Mapping[str, slice]]
+) -> Observed:
+    """What a policy observes, from a configuration's node ``model`` and the observation's spec.
 
     Raises:
-        ValueError: With the ``model`` to choose.
+        ValueError: If dictionaries or pictures have no encoder, or encoders of pictures no picture;
+            the message has the ``model`` to choose.
     """
-    encoders, entries = observed.encoders, observed.entries
+    entries, encoders = observed_entries(spec), model.get("encoders")
     is_vector = len(entries) == 1 and len(entries[0].shape) == 1
     if encoders is not None and not encoders["vector"] and is_vector:
         raise ValueError(
@@ -147,8 +134,10 @@ def check_encoders(observed: Observed) -> None:
         advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(
             f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
-            f"vector: use {advice}, or {TO_FLATTEN}."
+            f"vector: use {advice}, or make the environment flatten them: with "
+            "env.observation_flatten=true in Safety Gym, else with env.flatten=true."
         )
+    return Observed(entries, layouts, model["input_scale"], model.get("normalise"), encoders)
 
 
 class Codes(nn.Module):

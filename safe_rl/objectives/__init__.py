@@ -3,8 +3,8 @@
 They read and write entries of TensorDicts, and do not depend on an environment.
 """
 
-from safe_rl.objectives.actor_critic import ActorCriticLoss, JointAdvantages
-from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.actor_critic import ActorCriticLoss
+from safe_rl.objectives.advantages import CostGAE, JointAdvantages, VectorGAE
 from safe_rl.objectives.cal import CALLoss
 from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
 from safe_rl.objectives.cost_values import CostValues, GaussianCosts, MeanCosts, QuantileCosts

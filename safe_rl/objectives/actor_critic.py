@@ -1,16 +1,13 @@
-"""A joint loss and a joint advantage estimator of policy and critics, for TorchRL's trainers."""
+"""A joint loss of policy and critics, for TorchRL's trainers."""
 
 from __future__ import annotations
-
-from typing import Any
 
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torchrl.objectives import LossModule
 
-from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.advantages import VectorGAE
 from safe_rl.objectives.critics import CriticLoss
-from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.surrogate import SurrogateLoss
 
 
@@ -83,56 +80,3 @@ class ActorCriticLoss(LossModule):
             for name, value in critic
         }
         return TensorDict({**self.policy_loss(tensordict), **weighed})
-
-
-class JointAdvantages(TensorDictModuleBase):
-    """Normalised advantages of the reward and of the costs, in one call per batch.
-
-    TorchRL's trainers accept it in place of their `GAE`.
-
-    Args:
-        reward: Estimator of the reward advantage.
-        cost: Estimator of the cost advantages, or None.
-
-    Examples:
-        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
-        >>> estimator = JointAdvantages(
-        ...     VectorGAE(None, **settings), CostGAE(["cost"], None, **settings)
-        ... )
-        >>> estimator.out_keys
-        ['advantage', 'value_target', 'cost_advantage', 'cost_value_target']
-    """
-
-    def __init__(self, reward: VectorGAE, cost: CostGAE | None = None) -> None:
-        super().__init__()
-        self.reward, self.cost = reward, cost
-
-    @property
-    def _estimators(self) -> list[VectorGAE]:
-        return [part for part in (self.reward, self.cost) if part is not None]
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries of the rollout that are read."""
-        return list(dict.fromkeys(key for part in self._estimators for key in part.in_keys))
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries that are written."""
-        return [key for part in self._estimators for key in part.out_keys]
-
-    def set_keys(self, **kwargs: Any) -> None:
-        """Set keys of the reward's estimator; ``done`` and ``terminated`` also of the costs'."""
-        self.reward.set_keys(**kwargs)
-        if self.cost is not None:
-            ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}
-            self.cost.set_keys(**ends)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write advantages and value targets into a rollout [..., T], and return it."""
-        self.reward(tensordict)
-        keys = {"advantage": self.reward.tensor_keys.advantage}
-        if self.cost is not None:
-            self.cost(tensordict)
-            keys["cost_advantage"] = self.cost.tensor_keys.advantage
-        return normalise_advantages(tensordict, **keys)

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.checks import Checked, Share
-from safe_rl.objectives.gae import gae, one_pass_values, trajectory_ends
+from safe_rl.objectives.gae import gae, normalise_advantages, one_pass_values, trajectory_ends
 from safe_rl.objectives.samples import require, sample_mask
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
@@ -212,3 +212,56 @@ class CostGAE(VectorGAE):
         if not cost_keys or isinstance(cost_keys, str):
             raise ValueError("cost_keys must be a list with at least one cost, such as ['cost'].")
         self.set_keys(reward=list(cost_keys))
+
+
+class JointAdvantages(TensorDictModuleBase):
+    """Normalised advantages of the reward and of the costs, in one call per batch.
+
+    TorchRL's trainers accept it in place of their `GAE`.
+
+    Args:
+        reward: Estimator of the reward advantage.
+        cost: Estimator of the cost advantages, or None.
+
+    Examples:
+        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+        >>> estimator = JointAdvantages(
+        ...     VectorGAE(None, **settings), CostGAE(["cost"], None, **settings)
+        ... )
+        >>> estimator.out_keys
+        ['advantage', 'value_target', 'cost_advantage', 'cost_value_target']
+    """
+
+    def __init__(self, reward: VectorGAE, cost: CostGAE | None = None) -> None:
+        super().__init__()
+        self.reward, self.cost = reward, cost
+
+    @property
+    def _estimators(self) -> list[VectorGAE]:
+        return [part for part in (self.reward, self.cost) if part is not None]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the rollout that are read."""
+        return list(dict.fromkeys(key for part in self._estimators for key in part.in_keys))
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that are written."""
+        return [key for part in self._estimators for key in part.out_keys]
+
+    def set_keys(self, **kwargs: Any) -> None:
+        """Set keys of the reward's estimator; ``done`` and ``terminated`` also of the costs'."""
+        self.reward.set_keys(**kwargs)
+        if self.cost is not None:
+            ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}
+            self.cost.set_keys(**ends)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write advantages and value targets into a rollout [..., T], and return it."""
+        self.reward(tensordict)
+        keys = {"advantage": self.reward.tensor_keys.advantage}
+        if self.cost is not None:
+            self.cost(tensordict)
+            keys["cost_advantage"] = self.cost.tensor_keys.advantage
+        return normalise_advantages(tensordict, **keys)

@@ -18,8 +18,6 @@ from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
 
-_COSTS = "cost_qvalue_network"
-
 
 class CostCritics(QFunctionLoss):
     """Mixin that adds k cost critics to an off-policy loss: their TD(0) loss, the actor's penalty.
@@ -131,7 +129,7 @@ class CostCritics(QFunctionLoss):
         kind: Literal["own", "target", "frozen"] = "own",
     ) -> Tensor:
         """Numbers of the E critics for actions, [n, E, ..., k]; arguments as of `q_values`."""
-        outputs = self.q_values(_COSTS, steps, action, kind)
+        outputs = self.q_values("cost_qvalue_network", steps, action, kind)
         return self.cost_values.arranged(outputs, len(self.cost_keys))
 
     @torch.no_grad()

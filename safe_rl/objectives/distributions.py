@@ -98,13 +98,8 @@ def kl(
 
     Without a closed form it is estimated from an action a that q sampled in each state, as ρ log ρ
     − ρ + 1 with ρ = p(a)/q(a). The estimate is unbiased and never negative. For p = q it is 0 with
-    a zero gradient (Schulman, *Approximating KL divergence*, 2020).
-
-    Args:
-        p: Distribution in the states [...].
-        q: Distribution in the same states.
-        log_weight: Log ρ of the sampled actions, [...].
-        batch: The sampled actions, under the keys of the parts; for composite distributions only.
+    a zero gradient (Schulman, *Approximating KL divergence*, 2020). `log_weight` is log ρ of these
+    actions, [...]. For composite distributions the batch has them, under the keys of the parts.
     """
     if isinstance(p, CompositeDistribution):
         assert batch is not None
@@ -158,8 +153,7 @@ def composite_keys(
 class ReferencePolicy:
     """The current policy in the states of a batch, to measure the KL of later policies from it.
 
-    Args:
-        distribution: Distribution of the current policy in these states, without gradients.
+    It is given by its distribution in these states, without gradients.
     """
 
     def __init__(self, distribution: Distribution) -> None:

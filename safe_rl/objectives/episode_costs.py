@@ -43,12 +43,8 @@ class CostEstimate(NamedTuple):
 def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
     """J_c as cost per step times steps per episode, with the standard error over rows.
 
-    Args:
-        costs: Costs of N rows of T consecutive steps, [N, T, k].
-        length: Mean episode length T̄ in steps, scalar.
-
-    Returns:
-        The estimate. If there are few rows, they are cut into pieces that are taken as independent.
+    Costs are [N, T, k]: N rows of T consecutive steps. If there are few rows, they are cut into
+    pieces that are taken as independent.
 
     Examples:
         >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)

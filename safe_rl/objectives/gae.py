@@ -28,15 +28,9 @@ def one_pass_values(
     """Evaluate every observation of a rollout once.
 
     Inside a trajectory the next observation of step t is the root observation of step t + 1. So
-    only the last observations of trajectories are evaluated in addition. A recurrent network reads
-    the rollout as sequences, and the last observations as sequences of one step with their
-    recurrent states.
-
-    Args:
-        tensordict: Rollout [..., T] with the network's in_keys, also under ``"next"``.
-        value_network: Writes `key`, [..., T, F].
-        key: The network's value key.
-        ends: [..., T] bool, see `trajectory_ends`.
+    only the last observations of trajectories, where `ends` is set, are evaluated in addition. A
+    recurrent network reads the rollout as sequences, and the last observations as sequences of one
+    step with their recurrent states.
 
     Returns:
         Values of the root observations and of the next observations, both [..., T, F].
@@ -65,17 +59,8 @@ def gae(
 ) -> Tensor:
     """Generalised advantage estimate (Schulman et al. 2016, equation 16).
 
-    Args:
-        reward: [..., T, F], F reward-like signals.
-        value: [..., T, F], values of the observations.
-        next_value: [..., T, F], values of the next observations.
-        done: [..., T, 1] bool, trajectory ends.
-        terminated: [..., T, 1] bool, ends after which values are not bootstrapped.
-        gamma: Discount per step.
-        lmbda: Decay of the TD errors.
-
-    Returns:
-        Advantages, [..., T, F].
+    Advantages and their arguments are [..., T, F] for F reward-like signals. The flags are
+    [..., T, 1]; where `terminated` is set, values are not bootstrapped.
     """
     if gamma * lmbda == 0:
         # With a decay of 0, TorchRL's function loses even the first TD error.

@@ -16,15 +16,10 @@ from safe_rl.naming import key_name, nearest
 
 
 def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tensor:
-    """Get an entry, or raise an error that names the nearest key present.
-
-    Args:
-        tensordict: The batch to read.
-        key: Entry to get.
-        hint: What writes this entry, for the error message.
+    """Get an entry; the `hint` in the error says what writes it.
 
     Raises:
-        KeyError: If there is no such entry.
+        KeyError: If there is no such entry; the message names the nearest key present.
     """
     value = tensordict.get(key, None)
     if value is not None:

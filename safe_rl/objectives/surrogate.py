@@ -26,15 +26,10 @@ from safe_rl.objectives.samples import SharesTensors, inputs_of, require, sample
 
 
 def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
-    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ).
+    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ) per sample, [..., 1], from L_r [..., 1] and L_c [..., k].
 
     The division keeps the step size of an optimiser independent of λ (Stooke, Achiam and
     Abbeel 2020, section 4.4).
-
-    Args:
-        reward_gain: Per-sample reward surrogate, [..., 1].
-        cost_gain: Per-sample cost surrogates, [..., k].
-        multipliers: λ, [k].
     """
     penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
     return (reward_gain - penalty) / (1 + multipliers.sum())
@@ -43,9 +38,7 @@ def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> T
 def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Tensor:
     """Kish's effective sample size of importance weights, as a fraction of the samples.
 
-    Args:
-        log_weight: Logarithms of the weights, any shape.
-        mask: Bool mask of the weights that count, with the same number of elements; None: all.
+    Weights are given by their logarithms; a bool mask of as many elements says which count.
     """
     log_weight = log_weight.flatten()
     if mask is not None:
@@ -133,7 +126,6 @@ class SurrogateLoss(Checked, SharesTensors):
         Args:
             batch: Batch of any shape.
             limits: State after this batch; a loss without costs needs none.
-
         """
         if self.has_costs:
             self.limits = limits

@@ -20,8 +20,8 @@ IN_KEYS = [
 
 def make_memory(**keys):
     settings = {
-        "capacity": 1000, "batch_size": 64, "in_keys": IN_KEYS, "reward_keys": ["reward", "cost"],
-        "reward_gamma": 0.5, "n_steps": 1, "keep": True,
+        "capacity": 1000, "batch_size": 64, "in_keys": IN_KEYS,
+        "gammas": {"reward": 0.5, "cost": 0.5}, "n_steps": 1, "keep": True,
     }  # fmt: skip
     return Memory(**{**settings, **keys})
 
@@ -95,7 +95,7 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
 def test_sums_may_have_discounts_of_their_own():
     plain, own, copy = (
         make_memory(n_steps=3),
-        *(make_memory(n_steps=3, gammas={"cost": 0.9}) for _ in range(2)),
+        *(make_memory(n_steps=3, gammas={"reward": 0.5, "cost": 0.9}) for _ in range(2)),
     )
     for first in range(0, 12, 4):
         copy.load_state_dict(own.state_dict())
@@ -174,8 +174,7 @@ def prioritised_by(errors, **exponents):
     memory.extend(make_batch(0, 10, rows=1))
     for minibatch in memory.minibatches(5):
         number = minibatch["observation"].squeeze(-1).long()
-        minibatch["td_error"] = torch.tensor(errors)[number]
-        memory.learned(minibatch)
+        memory.set_priorities(minibatch, torch.tensor(errors)[number])
     return memory
 
 
@@ -204,8 +203,7 @@ def test_the_oldest_go_with_their_priorities():
     memory = make_memory(capacity=4, keep=False, prioritised={"alpha": 1.0, "beta": 1.0})
     memory.extend(make_batch(0, 4, rows=1))
     for minibatch in memory.minibatches(2):
-        minibatch["td_error"] = minibatch["observation"].squeeze(-1) * 0
-        memory.learned(minibatch)
+        memory.set_priorities(minibatch, torch.zeros(len(minibatch)))
     memory.extend(make_batch(4, 2, rows=1))
     drawn = torch.cat([m["observation"] for m in memory.minibatches(20)])
     assert set(drawn.flatten().tolist()) == {4, 5}
