@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, known
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, require_limits
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
@@ -73,7 +73,7 @@ class CPOStep(TRPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        g, b, c = self._linearised(losses, known(limits))
+        g, b, c = self._linearised(losses, require_limits(limits))
         # With its gradient set to 0, the dual leaves out a satisfied constraint (case 4).
         b = b * ~((b.square().sum(-1, keepdim=True) <= _NO_GRADIENT) & (c[:, None] < 0))
         v, w = self._solve_all(fisher, g, b)
@@ -213,7 +213,7 @@ class PCPOStep(CPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        g, b, c = self._linearised(losses, known(limits))
+        g, b, c = self._linearised(losses, require_limits(limits))
         v, w = self._solve_all(fisher, g, b)
         c = self._bounded(c, (b * w).sum(-1))
         for_reward = self._longest(v, g)

@@ -101,8 +101,8 @@ def _fill(
         )
     costs = [("next", key) for key in env.cost_keys if ("next", key) in steps.keys(True)]
     check_steps({key: steps[key] for key in {*buffer.in_keys, *costs}}, costs)
-    warning = "" if is_recorded else _check_meanings(steps, env)
-    warning += _arrange(steps, interface, node, env)
+    warning = "" if is_recorded else _check_costs_and_ends(steps, env)
+    warning += _order_columns(steps, interface, node, env)
     number = steps.batch_size.numel()
     if node.safe_episodes:
         if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
@@ -115,14 +115,14 @@ def _fill(
             f"of its {number:,} transitions {taken:,} are taken{what}. There must be some, and "
             f"room for them: memory.capacity={buffer.capacity}."
         )
-    steps["action"] = _as_chosen(steps["action"], interface, is_recorded, env, actions)
+    steps["action"] = _in_units_of_policy(steps["action"], interface, is_recorded, env, actions)
     buffer.extend(steps)
     buffer.end_rows()
     kept = "those of whole episodes that keep the limits" if node.safe_episodes else "all"
     return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}.{warning}"
 
 
-def _check_meanings(steps: TensorDictBase, env: EnvBase) -> str:
+def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> str:
     """Refuse steps [1, M] of a file whose costs or ends cannot be what they are here.
 
     Returns:
@@ -153,7 +153,7 @@ def _check_meanings(steps: TensorDictBase, env: EnvBase) -> str:
     return warning
 
 
-def _arrange(
+def _order_columns(
     steps: TensorDictBase, interface: Mapping[str, Any], node: DictConfig, env: EnvBase
 ) -> str:
     """Put the columns of observations into the environment's order; return a warning, or ""."""
@@ -185,7 +185,7 @@ def _arrange(
     return " Warning: it does not name the columns of its observations, which are used as they are."
 
 
-def _as_chosen(
+def _in_units_of_policy(
     action: Tensor, interface: Mapping[str, Any], is_recorded: bool, env: EnvBase, spec: TensorSpec
 ) -> Tensor:
     """Actions [N, T, A] of a dataset in the units in which policies choose them.

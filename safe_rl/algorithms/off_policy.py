@@ -109,7 +109,7 @@ class OffPolicy(Resumable, Algorithm):
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)
-        policy = exploring(networks["actor"], env, config.exploration.noise)
+        policy = exploring_policy(networks["actor"], env, config.exploration.noise)
         if policy.noise and policy.samples:
             raise ValueError(
                 f"exploration.noise={policy.noise}: the policy of algo={config.algo.name} samples "
@@ -134,7 +134,7 @@ class OffPolicy(Resumable, Algorithm):
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build the policy for evaluation, without exploration noise."""
         actor = build_networks(config, env, 0, device)["actor"]
-        return exploring(actor, env, 0.0), {"actor": actor}
+        return exploring_policy(actor, env, 0.0), {"actor": actor}
 
     @property
     def lost_on_resume(self) -> str:
@@ -237,7 +237,7 @@ def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) 
     )
 
 
-def exploring(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
+def exploring_policy(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:
     """The exploring policy of an actor, within the bounds of an environment's actions."""
     spec = bounded_actions(env)
     return ExploringPolicy(actor, spec.low, spec.high, noise=noise)

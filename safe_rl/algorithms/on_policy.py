@@ -24,7 +24,7 @@ from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
-from safe_rl.models import build_networks, make_behaviour, take_in
+from safe_rl.models import build_networks, make_behaviour, update_running_scales
 from safe_rl.objectives import (
     CostGAE,
     CriticLoss,
@@ -133,7 +133,7 @@ class OnPolicy(Algorithm):
         bias = self._critic_bias(batch)
         metrics = self._update(batch, limits)
         constraints.record_prediction(limits, metrics["policy"])
-        take_in(self.networks.values(), batch)
+        update_running_scales(self.networks.values(), batch)
         row = constraints.columns(limits, multiplier) | bias
         for network, values in metrics.items():
             for name, value in values.items():

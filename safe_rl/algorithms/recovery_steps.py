@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, known
+from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, require_limits
 from safe_rl.checks import Fraction
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
@@ -101,7 +101,7 @@ class CTRPOStep(TRPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        surrogates, state = losses["cost_surrogate"], known(limits)
+        surrogates, state = losses["cost_surrogate"], require_limits(limits)
         length = state.length_for(surrogates)
         violation = state.required_decrease_for(surrogates)
         is_above = violation >= self.recovered.to(violation)
@@ -171,14 +171,11 @@ class CRPOStep(TRPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        excess = known(limits).required_decrease_for(losses["cost_surrogate"]) - self.tolerance
-        worst = int(excess.argmax())
-        reduces = torch.zeros_like(excess)
-        if excess[worst] > 0:
-            reduces[worst] = 1.0
-            proposal = self._natural_step(
-                losses, fisher, lambda after: after["cost_surrogate"][worst]
-            )
-        else:
-            proposal = super()._propose(losses, fisher, limits)
-        return proposal._replace(diagnostics={**proposal.diagnostics, "reduces": reduces})
+        decrease = require_limits(limits).required_decrease_for(losses["cost_surrogate"])
+        worst = int(decrease.argmax())
+        is_above = decrease[worst] > self.tolerance
+        reduces = torch.zeros_like(decrease)
+        reduces[worst] = is_above
+        objective = (lambda of: of["cost_surrogate"][worst]) if is_above else finite_sum
+        proposal = self._natural_step(losses, fisher, objective)
+        return proposal._replace(diagnostics={"reduces": reduces})

@@ -134,12 +134,12 @@ class Memory(Checked):
             return
         waiting = self._n_step_transforms[0]._buffer.clone()
         waiting["next", "done"][..., -1, :] = True
-        self._wait_with(waiting)
+        self._set_waiting(waiting)
         beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._n_step_transforms[0].n_steps)
         self._add([self._over_steps(beyond)])
-        self._wait_with(None)
+        self._set_waiting(None)
 
-    def _wait_with(self, steps: TensorDictBase | None) -> None:
+    def _set_waiting(self, steps: TensorDictBase | None) -> None:
         """Set the last steps, whose sums are not complete."""
         for number, transform in enumerate(self._n_step_transforms):
             kept = steps if steps is None or not number else steps.select(*_read_by(transform))
@@ -194,10 +194,10 @@ class Memory(Checked):
         self._buffer.writer.load_state_dict(writer)
         if self.is_prioritised:
             self._buffer.sampler.load_state_dict(state_dict["sampler"])
-        self._wait_with(None)
+        self._set_waiting(None)
         if self._n_step_transforms and "tail" in state_dict:
             tail, shape = state_dict["tail"], state_dict["tail_shape"]
-            self._wait_with(self._restored(tail, shape, [("next", "done")]))
+            self._set_waiting(self._restored(tail, shape, [("next", "done")]))
 
     def _restored(
         self, entries: Mapping[str, Tensor], shape: list[int], further: Sequence[NestedKey]

@@ -37,7 +37,7 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 """A loss module, or a function of your own from a batch to scalars ``loss_…``."""
 
 
-def known(limits: LimitState | None) -> LimitState:
+def require_limits(limits: LimitState | None) -> LimitState:
     """The state of the limits, which a constrained step cannot do without."""
     if limits is None:
         raise ValueError(

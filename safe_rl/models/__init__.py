@@ -13,7 +13,7 @@ from safe_rl.models.networks import (
     input_scale_vector,
     make_actor,
     make_critic,
-    take_in,
+    update_running_scales,
 )
 from safe_rl.models.replay_networks import (
     EnsembleMLP,
@@ -37,5 +37,5 @@ __all__ = [
     "make_bounded_actor",
     "make_critic",
     "make_squashed_actor",
-    "take_in",
+    "update_running_scales",
 ]

@@ -214,7 +214,7 @@ class RunningScale(nn.Module):
         self.count.copy_(total)
 
 
-def take_in(networks: Iterable[nn.Module], batch: TensorDictBase) -> None:
+def update_running_scales(networks: Iterable[nn.Module], batch: TensorDictBase) -> None:
     """Update all running scales of networks with a batch."""
     for network in networks:
         for module in network.modules():

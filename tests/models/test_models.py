@@ -18,7 +18,7 @@ from safe_rl.models import (
     make_actor,
     make_behaviour,
     make_critic,
-    take_in,
+    update_running_scales,
 )
 from safe_rl.objectives import CriticLoss
 
@@ -164,7 +164,7 @@ def test_losses_that_were_made_before_see_them_move():
     critic.module.insert(0, RunningScale(3, key="observation", clip=10.0))
     loss, (batch, other) = CriticLoss(critic), batches(2)
     batch["value_target"] = torch.zeros(5, 20, 1)
-    take_in([critic], other)
+    update_running_scales([critic], other)
     with torch.no_grad():
         expected = nn.functional.mse_loss(critic(batch)["state_value"], batch["value_target"])
         assert loss(batch)["loss_critic"].item() == pytest.approx(expected.item())

@@ -12,7 +12,7 @@ from safe_rl.evaluation import certify
 from safe_rl.evaluation.loading import maker_of
 from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import certificate_options
-from safe_rl.models import RunningScale, take_in
+from safe_rl.models import RunningScale, update_running_scales
 
 READ = {"model.critic_observes": ["observation", "privileged"], "env.observe_privileged": True}
 SMALL = {"num_envs": 4, "frames_per_batch": 80, "frames": 240, "num_threads": 1, "seed": 3}
@@ -112,7 +112,7 @@ def test_its_columns_are_normalised():
     env = make()
     config = compose_config("env=PointGoal2", *words("algo=ppo", "model.normalise=10"))
     algorithm, batch = OnPolicy.from_config(config, env), env.rollout(5)
-    take_in(algorithm.networks.values(), batch)
+    update_running_scales(algorithm.networks.values(), batch)
     scales = [m for m in algorithm.critic.modules() if isinstance(m, RunningScale)]
     assert [scale.key for scale in scales] == ["observation", "privileged"]
     mean = batch["privileged"].flatten(0, 1).double().mean(0)
