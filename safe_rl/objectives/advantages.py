@@ -8,6 +8,7 @@ it ends with ``("next", "terminated")``, the value of its last observation is bo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -101,30 +102,59 @@ class VectorGAE(Checked, ValueEstimatorBase):
 
     @dispatch
     @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        *,
+        params: TensorDictBase | None = None,
+        target_params: TensorDictBase | None = None,
+    ) -> TensorDictBase:
         """Write values, advantages and value targets into a rollout; they are 0 in padding.
 
         Args:
             tensordict: Rollout [..., T] with `in_keys`, or these entries as keyword arguments.
+            params: Parameters to run the value network with instead of its own.
+            target_params: Must be None; a single pass has a single set of parameters.
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If values, signals and ends do not match in shape, or if there is a
-                dimension between time and the signals.
+            ValueError: If values, signals and ends do not match in shape, if there is a dimension
+                between time and the signals, or if `target_params` is given.
         """
         keys = self.tensor_keys
-        value, advantage, target = self._estimate(tensordict)
+        value, advantage, target = self._estimate(tensordict, params, None, target_params)
         tensordict.set(keys.value, value)
         tensordict.set(keys.advantage, advantage)
         return tensordict.set(keys.value_target, target)
 
     @torch.no_grad()
-    def value_estimate(self, tensordict: TensorDictBase) -> Tensor:
-        """The value targets alone, [..., T, F]; the rollout stays as it is."""
-        return self._estimate(tensordict)[-1]
+    def value_estimate(
+        self,
+        tensordict: TensorDictBase,
+        target_params: TensorDictBase | None = None,
+        next_value: Tensor | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """The value targets alone, [..., T, F]; the rollout stays as it is.
 
-    def _estimate(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        Args:
+            tensordict: Rollout [..., T] with `in_keys`.
+            target_params: Must be None, as in `forward`.
+            next_value: Values of the next observations, [..., T, F], instead of the network's.
+            kwargs: Arguments of TorchRL's other estimators; they are ignored.
+        """
+        return self._estimate(tensordict, None, next_value, target_params)[-1]
+
+    def _estimate(
+        self,
+        tensordict: TensorDictBase,
+        params: TensorDictBase | None,
+        next_value: Tensor | None,
+        target_params: TensorDictBase | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Value, advantage and value target, [..., T, F] each."""
+        if target_params is not None:
+            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
         reward = torch.cat(signals, -1)
@@ -139,7 +169,8 @@ class VectorGAE(Checked, ValueEstimatorBase):
             )
         mask = sample_mask(tensordict)
         ends = trajectory_ends(done, mask)
-        value, next_value = self._values(tensordict, ends)
+        value, following = self._values(tensordict, ends, params)
+        next_value = following if next_value is None else next_value
         if value.shape != reward.shape:
             raise ValueError(
                 f"{keys.value!r} has shape {tuple(value.shape)} but the signals "
@@ -161,14 +192,16 @@ class VectorGAE(Checked, ValueEstimatorBase):
             advantage, target = (x.masked_fill(padded, 0.0) for x in (advantage, target))
         return value, advantage, target
 
-    def _values(self, tensordict: TensorDictBase, ends: Tensor) -> tuple[Tensor, Tensor]:
-        """Values of the observations and of the next ones, [..., T, F] each."""
+    def _values(
+        self, tensordict: TensorDictBase, ends: Tensor, params: TensorDictBase | None
+    ) -> tuple[Tensor, Tensor]:
         key, network = self.tensor_keys.value, self.value_network
         if network is None:
             hint = "With value_network=None the values must be there before."
             following = require(tensordict, ("next", key), hint)
             return require(tensordict, key, hint), following
-        return one_pass_values(tensordict, network, key, ends)
+        with nullcontext() if params is None else params.to_module(network):
+            return one_pass_values(tensordict, network, key, ends)
 
 
 class CostGAE(VectorGAE):

@@ -93,6 +93,16 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
             **reported,
         )
 
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The sum of `critic_losses`, and each of them, for scripts of TorchRL's TD3."""
+        losses = self.critic_losses(tensordict)
+        return sum(losses.values()), losses.detach().to_dict()
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of `actor_losses`, and its other entries, for scripts of TorchRL's TD3."""
+        losses = self.actor_losses(tensordict).to_dict()
+        return losses.pop("loss_actor"), losses
+
 
 class TD3LagrangianLoss(CostCritics, TD3Loss):
     """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.

@@ -30,6 +30,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         alpha_init: Initial entropy coefficient (temperature) α.
         target_entropy: Entropy of the policy that α is adapted to reach; ``"auto"`` is −A for
             actions [A].
+        fixed_alpha: Whether the entropy coefficient α is constant.
         action_spec: Spec of one action [A]; needed for ``target_entropy="auto"``.
 
     Examples:
@@ -51,6 +52,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         gamma: Share,
         alpha_init: Annotated[float, Interval(ge=1e-9, le=1e9)],
         target_entropy: FiniteFloat | Literal["auto"] = "auto",
+        fixed_alpha: bool = False,
         action_spec: TensorSpec | None = None,
     ) -> None:
         check_ensemble(qvalue_network, "Q function of rewards")
@@ -61,6 +63,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
             loss_function="l2",
             alpha_init=alpha_init,
             target_entropy=target_entropy,
+            fixed_alpha=fixed_alpha,
             action_spec=action_spec,
         )
         self.gamma = gamma

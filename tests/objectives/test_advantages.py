@@ -144,3 +144,8 @@ def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
     assert set(rollout.keys(True, True)) == before
     theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(rollout.clone())
     torch.testing.assert_close(found, theirs["value_target"], atol=1e-5, rtol=1e-5)
+    zero = torch.zeros_like(rollout["next", "reward"])
+    greedy = VectorGAE(critic, gamma=0.95, lmbda=0.0, value_target="lambda_return")
+    torch.testing.assert_close(
+        greedy.value_estimate(rollout, next_value=zero), rollout["next", "reward"]
+    )

@@ -132,6 +132,17 @@ def test_an_ensemble_gives_what_torchrl_gives(kind):
         torch.testing.assert_close(value, gradients[1][name])
 
 
+def test_scripts_of_torchrls_td3_find_the_two_losses():
+    loss, steps = make_loss("td3"), make_steps()
+    stock = as_stock(loss, "td3")
+    for name in ("value_loss", "actor_loss"):
+        found = []
+        for module in (loss, stock):
+            torch.manual_seed(1)
+            found.append(getattr(module, name)(steps.clone())[0])
+        torch.testing.assert_close(*found)
+
+
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     loss, steps = make_loss(kind, lagrange(2.0, 3.0), pessimism=0.5), make_steps()
