@@ -185,9 +185,8 @@ def single(campaign: str) -> str:
             row["bound"] = f"{claim} at {told['episode_return']:.1f}"
         rows.append(row)
     settings = ["name"] if len({row["name"] for row in rows}) > 1 else []
-    # of trials that were stopped, ends cannot be compared
-    ends = () if campaign == "privileged_trials" else ("cost", "return", "rate", "bound")
     names = [name for name in names if any(row[name] for row in rows)]
+    ends = ("cost", "return", "rate", "bound")
     return table(rows, "environment", *settings, "seed", *ends, "steps", *names)
 
 

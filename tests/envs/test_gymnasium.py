@@ -3,6 +3,7 @@
 import warnings
 
 import gymnasium
+import gymnasium_loop
 import numpy as np
 import pytest
 import torch
@@ -212,3 +213,9 @@ def test_bounds_are_true(flatten):
     for _ in range(50):
         assert observation in envs.observation_space
         observation, *_ = envs.step(envs.action_space.sample())
+
+
+def test_the_example_of_a_loop_finds_the_costs_of_episodes(capsys):
+    first, second = gymnasium_loop.train(num_steps=20, updates=2, limit=-1.0)
+    assert second > first >= 0.01
+    assert capsys.readouterr().out.count("8 episodes") == 2
