@@ -21,6 +21,7 @@ from pydantic import PositiveInt
 from safe_rl.checks import CheckedOptions, option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
+from safe_rl.naming import did_you_mean
 from safe_rl.reporting import figures, scoring, slates
 from safe_rl.reporting.archive import Run, find_runs
 from safe_rl.reporting.curves import (
@@ -257,12 +258,18 @@ def write_report(report: Report, out: Path, title: str, options: ReportOptions) 
 
     Raises:
         ModuleNotFoundError: If Jinja is missing; the message names the extra.
+        ValueError: If no table has one of the columns that ``options.columns`` names.
     """
     jinja2 = import_extra("jinja2", "report")
-    out.mkdir(parents=True, exist_ok=True)
-    place = _places(out)
     columns = listed(options.columns)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
+    known = dict.fromkeys(title for table in tables for title in table.plain_titles)
+    for name in columns:
+        if name not in known:
+            hint = did_you_mean(name, known) or f" They have {', '.join(known)}."
+            raise ValueError(f"columns={name}: no table has this column.{hint}")
+    out.mkdir(parents=True, exist_ok=True)
+    place = _places(out)
     replace_text(out / "tables.tex", "\n".join(table.latex(columns) for table in tables))
     curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
     curves.write_csv(out / "curves.csv")

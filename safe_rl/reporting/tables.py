@@ -133,6 +133,11 @@ class Table:
         """Whether each column has numbers: then the first field of its template has a format."""
         return [":" in template.partition("}")[0] for template in self.columns.values()]
 
+    @property
+    def plain_titles(self) -> list[str]:
+        """Titles of the columns, without ``$`` and backslashes."""
+        return [re.sub(r"[$\\]", "", title) for title in self.columns]
+
     def rows(self) -> list[list[Cell]]:
         """The entries that the page shows."""
         return [
@@ -147,16 +152,13 @@ class Table:
         """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit.
 
         Args:
-            columns: Titles of the columns to write, without ``$`` and backslashes; empty: all.
+            columns: Plain titles of the columns to write; empty: all.
         """
         looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
         cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
         frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
-        kept = [
-            place
-            for place, title in enumerate(self.columns)
-            if not columns or re.sub(r"[$\\]", "", title) in columns
-        ]
+        titles = enumerate(self.plain_titles)
+        kept = [place for place, title in titles if not columns or title in columns]
         frame = frame.iloc[:, kept]
         sides = "".join("r" if self.numbers[place] else "l" for place in kept)
         text: str = frame.to_latex(index=False, escape=False, column_format=sides)
