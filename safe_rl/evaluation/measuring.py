@@ -26,6 +26,7 @@ from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
+from safe_rl.runs.checkpoints import hold
 from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
@@ -184,7 +185,7 @@ def evaluate(
     directory = writable_copy(directory)
     run = Run(directory)
     config = run.config
-    checkpoint = run.find_checkpoint(options.checkpoint)
+    checkpoint = hold(run.find_checkpoint(options.checkpoint))
     changed = config.copy()
     changed.env = override_env(config, options.env)
     evaluation = PolicyEvaluation(changed, checkpoint, options, make_env or maker_of(directory))

@@ -21,6 +21,7 @@ from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.files import CONF, read_yaml, replace_csv
 from safe_rl.naming import did_you_mean
+from safe_rl.runs.checkpoints import hold
 from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import Estimate
 
@@ -245,7 +246,7 @@ def evaluate_variations(
     run, make_env = Run(directory), make_env or maker_of(directory)
     config = run.config
     config.env = override_env(config, options.env)
-    checkpoint = run.find_checkpoint(options.checkpoint)
+    checkpoint = hold(run.find_checkpoint(options.checkpoint))
     file, picture = (
         run.evaluation_file(options.name, kind, "variations") for kind in ("csv", "png")
     )

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any
 
 import torch
@@ -68,7 +68,27 @@ def policy_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
+class HeldCheckpoint(PosixPath):
+    """The path of a checkpoint that can be read after a run that trains has removed the file."""
+
+    content: dict[str, dict[str, Any]]
+
+
+def hold(path: Path) -> HeldCheckpoint:
+    """Open a checkpoint for all later reading.
+
+    Raises:
+        CheckpointError: If the file is no checkpoint, or is damaged.
+    """
+    _read(path)  # checked
+    held = HeldCheckpoint(path)
+    held.content = _read(path, lazy=True)
+    return held
+
+
 def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
+    if isinstance(path, HeldCheckpoint):
+        return path.content
     try:
         content = load_tensors(path, lazy=lazy)
         if not all(isinstance(content[name], dict) for name in ("facts", "parts")):

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from safe_rl.cli.evaluate import main
 from safe_rl.envs import make_env
 from safe_rl.evaluation import evaluate
+from safe_rl.runs.run import Run
 
 
 def read_columns(path):
@@ -117,6 +118,15 @@ def test_the_best_checkpoint_is_taken_on_demand(run):
         facts = evaluate(run, options(episodes=1, checkpoint=named)).facts
         assert facts["checkpoint_file"] == str(best)
         assert facts["steps"] == int(best.stem.removeprefix("checkpoint-"))
+
+
+def test_a_checkpoint_that_training_removes_meanwhile_is_evaluated(run):
+    def make(node, **settings):
+        for path in Run(run).checkpoints("last"):
+            path.unlink()
+        return make_env(node, **settings)
+
+    assert evaluate(run, options(), make_env=make).facts["steps"] == 320
 
 
 def test_the_command_prints_a_table(run, capsys):
