@@ -90,6 +90,7 @@ def test_any_configuration_can_be_made():
         (r"is a name: .*make_env\('PointRun'\)", "Safexp-Custom", {"config": "PointRun"}),
         ("mean 'velocity_threshold'", "SafeHopperVelocity", {"config": {"velocity_treshold": 1}}),
         (r"config=\{'hazards_num': …\}", "Safexp-PointGoal1", {"hazards_num": 3}),
+        (r"'seed': use reset\(seed=…\)", "Safexp-PointGoal1", {"seed": 3}),
         ("or a VelocityConfig; got a Safety", "SafeAntVelocity", {"config": SafetyGymConfig()}),
         ("render_mode must be one of", "SafeHopperVelocity", {"render_mode": "ansi"}),
     ):

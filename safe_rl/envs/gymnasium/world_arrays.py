@@ -31,6 +31,8 @@ from safe_rl.envs.velocity.velocity_env import VelocityEnv
 EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
 NUM_SEEDS = 2**62
 RENDER_MODES = ["rgb_array"]
+# what people give to `gymnasium.make` that neither it nor a configuration takes
+_ELSEWHERE = {"seed": "use reset(seed=…)", "num_envs": "use gymnasium.make_vec"}
 
 Observation = np.ndarray | dict[str, np.ndarray]
 Config = Mapping[str, Any] | SafetyGymConfig | VelocityConfig | None
@@ -64,10 +66,11 @@ class Worlds:
     ) -> None:
         if unknown:
             name = next(iter(unknown))
+            other = f"put keys of the configuration into config={{'{name}': …}}"
             # TorchRL's `GymEnv` tries an argument `frameskip`, and looks for these words
             raise TypeError(
-                f"{type(self).__name__} got an unexpected keyword argument '{name}': put keys of "
-                f"the configuration into config={{'{name}': …}}."
+                f"{type(self).__name__} got an unexpected keyword argument '{name}': "
+                f"{_ELSEWHERE.get(name, other)}."
             )
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
