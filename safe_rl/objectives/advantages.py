@@ -157,16 +157,19 @@ class VectorGAE(Checked, ValueEstimatorBase):
             raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
-        reward = torch.cat(signals, -1)
         done, terminated = (
             require(tensordict, ("next", key)) for key in (keys.done, keys.terminated)
         )
-        if reward.shape[:-1] != done.shape[:-1] or done.ndim > tensordict.ndim + 1:
+        shapes = [list(signal.shape) for signal in signals]
+        unlike = any(shape[:-1] != list(done.shape[:-1]) for shape in shapes)
+        if unlike or done.ndim > tensordict.ndim + 1:
             raise ValueError(
                 f"In a rollout {list(tensordict.batch_size)}, the signals {self.reward_keys} have "
-                f"shape {tuple(reward.shape)} and {keys.done!r} {tuple(done.shape)}: both have to "
-                "be [..., T, 1]. Of several agents, make rows: [..., agents, T]."
+                f"the shapes {shapes} and {keys.done!r} {list(done.shape)}: all must be "
+                "[..., T, 1]. If the last dimension is missing, as in infos that TorchRL's GymEnv "
+                "reads, use unsqueeze(-1). Of several agents, make rows: [..., agents, T]."
             )
+        reward = torch.cat(signals, -1)
         mask = sample_mask(tensordict)
         ends = trajectory_ends(done, mask)
         value, following = self._values(tensordict, ends, params)

@@ -133,6 +133,10 @@ def test_errors_say_what_to_change():
             of_agents["next", key] = of_agents["next", key].unsqueeze(-2).expand(N, T, 3, 1)
         with pytest.raises(ValueError, match=r"In a rollout \[4, 37\], .* agents"):
             reward(of_agents)
+    cost.set_keys(reward=["cost_hazards"])
+    rollout["next", "cost_hazards"] = rollout["next", "cost_hazards"].squeeze(-1)
+    with pytest.raises(ValueError, match=r"shapes \[\[4, 37\]\] and .* use unsqueeze\(-1\)"):
+        cost(rollout)
 
 
 def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
