@@ -3,34 +3,21 @@
 The key `_target_` of a node names its family: a function or class that is called with a mapping of
 the node's other keys, and `num_envs=`, `device=`, `seed=` and `num_threads=`. A node without it
 belongs to Safety Gym. Modules that build environments are not imported here, for a quick start.
-
-A configuration may come from an unknown source. So an `id` cannot make a library import a module:
-the user permits it by `import=`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Container, Mapping
-from dataclasses import dataclass
-from importlib import import_module
 from inspect import signature
-from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from hydra.core.config_store import ConfigStore
 
 from safe_rl.checks import Text
-from safe_rl.envs.keys import (
-    ConfigError,
-    Count,
-    Key,
-    checked,
-    on_cpu_only,
-    parse_ranges,
-    structured,
-)
+from safe_rl.envs.foreign import FOREIGN, complete_foreign
+from safe_rl.envs.keys import ConfigError, Count, Key, checked, structured
 from safe_rl.envs.safety_gym.config import KEYS, SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import (
@@ -51,105 +38,6 @@ if TYPE_CHECKING:
 GROUP = "env"  # the group of environments in Hydra
 VELOCITY_TARGET = "safe_rl.envs.velocity.VelocityEnv"
 SAFETY_GYM = "safety_gym"  # the default of every key of Safety Gym, from which others inherit
-
-_RANGES = (
-    "costs of leaving a range: cost_<kind> -> [column of the observation, lowest, highest], of "
-    "another entry [entry, column, lowest, highest]"
-)
-_PRIVILEGED = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
-_MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
-_COMMON = {
-    "cost_keys": Key(
-        None, tuple[Text, ...] | None, "names of the costs; null: `cost` and all `cost_<kind>`"
-    ),
-    "num_steps": Key(
-        None, Count | None, "steps after which an episode is truncated; null: its own number"
-    ),
-    "kwargs": Key(None, dict[str, Any] | None, "arguments of its constructor: {g: 9.81}"),
-}
-
-
-@dataclass(frozen=True)
-class ForeignFamily:
-    """The environments of one library; `env=<name> env.id=…` chooses one.
-
-    Attributes:
-        target: `_target_` of its nodes.
-        keys: Its keys. `id` and `name`, which all families have, are not listed.
-        describe: "module:function" that returns the cost keys and the length of episodes of a node.
-            If one of them is None, it makes an environment to find out.
-    """
-
-    target: str
-    keys: Mapping[str, Key]
-    describe: str
-
-
-# Name in the group `env` -> family of another library.
-FOREIGN = {
-    "gymnasium": ForeignFamily(
-        "safe_rl.envs.gymnasium.make_gymnasium",
-        {
-            **_COMMON,
-            "privileged": _PRIVILEGED,
-            "render_mode": _MODE,
-            "outside": Key(None, Any, _RANGES),
-            "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
-        },
-        "safe_rl.envs.gymnasium.conversion:describe_gymnasium",
-    ),
-    "safety_gymnasium": ForeignFamily(
-        "safe_rl.envs.gymnasium.make_safety_gymnasium",
-        {**_COMMON, "render_mode": _MODE},
-        "safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
-    ),
-    "torchrl": ForeignFamily(
-        "safe_rl.envs.torchrl.make_torchrl",
-        {
-            **_COMMON,
-            "observe": Key(None, tuple[Text, ...] | None, "entries; null: `observation` or all"),
-            "privileged": _PRIVILEGED,
-            "flatten": Key(True, bool, "true: several entries become one vector"),
-            "outside": Key(None, Any, _RANGES),
-            "cost": Key(None, Any, "a function from a step to its cost: my_module:function, or "
-                        "{_target_: my_module.function, limit: 4}"),
-        },
-        "safe_rl.envs.torchrl:describe_node",
-    ),
-}  # fmt: skip
-
-
-def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a node with all keys.
-
-    If its cost keys or the length of its episodes are None, they are read from an environment.
-
-    Raises:
-        ConfigError: For an unknown key or id, or an environment that the algorithms cannot use.
-    """
-    for key in node:
-        if key not in (*family.keys, "id", "name", "_target_"):
-            meant = did_you_mean(str(key), [*family.keys, "id"])
-            others = " The environment's own arguments belong in 'kwargs': env.kwargs='{…}'."
-            raise ConfigError(
-                f"This environment has no key '{key}'.{on_cpu_only(key) or meant + others}"
-            )
-    if not isinstance(node.get("id"), str):
-        raise ConfigError("Which environment? Name it: env.id=…")
-    module, _, plain = node["id"].rpartition(":")
-    if module and family is not FOREIGN["torchrl"]:  # Gymnasium would import it
-        raise ConfigError(
-            f"env.id={node['id']}: a configuration cannot import a module. If you trust "
-            f"'{module}', use {quote(f'import={module}')} {quote(f'env.id={plain}')}"
-        )
-    full = {"name": node["id"], **node}
-    for key, row in family.keys.items():
-        checked(key, row.annotation, full.setdefault(key, row.default))
-    parse_ranges(full.get("outside"))
-    if None in (full["cost_keys"], full["num_steps"]):
-        module, _, function = family.describe.partition(":")
-        full["cost_keys"], full["num_steps"] = getattr(import_module(module), function)(full)
-    return full
 
 
 def hint_of_gymnasium(name: str) -> str:

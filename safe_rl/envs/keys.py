@@ -1,12 +1,10 @@
 """Keys of environments: a type with its range, a default and a meaning each, also for Hydra.
 
-Also the error for a key that cannot be used, the names of costs, and the key `outside`, which gives
-costs for leaving a range.
+Also the error for a key that cannot be used, and the names of costs.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import field, make_dataclass
 from functools import cache, partial
@@ -22,16 +20,6 @@ from safe_rl.checks import SettingError, rule
 
 class ConfigError(ValueError):
     """A configuration cannot be used; the message names the key and what to change."""
-
-
-def on_cpu_only(key: str) -> str:
-    """Return a hint for MuJoCo Warp's keys, which other libraries lack; else an empty text."""
-    if key not in ("physics", "physics_buffers"):
-        return ""
-    return (
-        f" Only Safety Gym's environments and the velocity family have '{key}': the physics of all "
-        "others runs on the CPU only. Remove it, and preset=gpu, which sets 'physics'."
-    )
 
 
 # float32 can hold the square of the largest number
@@ -68,21 +56,21 @@ adapter = cache(checks.adapter)
 def checked(name: str, annotation: Any, value: Any) -> Any:
     """Return a value with the type of its key; ConfigError if the type or range is wrong."""
     try:
-        return adapter(annotation).validate_python(_plain(value))
+        return adapter(annotation).validate_python(as_plain(value))
     except ValidationError:
         try:
-            return checks.check_value(name, annotation, _plain(value))
+            return checks.check_value(name, annotation, as_plain(value))
         except SettingError as error:
             raise ConfigError(str(error)) from None
 
 
-def _plain(value: Any) -> Any:
+def as_plain(value: Any) -> Any:
     """Return numbers of NumPy and torch as Python's, and their arrays, lists, … as tuples."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
         return value
-    return tuple(map(_plain, value))
+    return tuple(map(as_plain, value))
 
 
 def describe(annotation: Any) -> str:
@@ -147,69 +135,8 @@ def _hydra_type(annotation: Any) -> Any:
 
 
 COST = "cost"
-_FORM = (
-    "'{cost_speed: [2, -4, 4]}' (column of the observation, lowest, highest), or for another entry "
-    "[thdot, -4, 4], or with its column [thdot, 0, -4, 4]"
-)
-
-
-class CostRange(NamedTuple):
-    """A range of values without a cost; values outside it have a cost.
-
-    Attributes:
-        entry: Name of the entry, with dots where it is nested.
-        column: Column of the entry, counted from 0.
-        low: Lowest value without a cost.
-        high: Highest value without a cost.
-    """
-
-    entry: str
-    column: int
-    low: float
-    high: float
 
 
 def is_cost(name: Any) -> bool:
     """Whether a name is that of a cost: `cost` or `cost_<kind>`."""
     return name == COST or str(name).startswith(f"{COST}_")
-
-
-def parse_ranges(outside: Any) -> dict[str, CostRange]:
-    """Return the ranges of the configuration key `outside`, by the names of their costs.
-
-    Args:
-        outside: Name -> (entry, column, lowest, highest). The default entry is the observation. The
-            default column of another entry is the first one. None means no ranges.
-
-    Raises:
-        ConfigError: If a name, the form of a range or its bounds are wrong.
-
-    Examples:
-        >>> parse_ranges({"cost_speed": ["thdot", -4, 4]})
-        {'cost_speed': CostRange(entry='thdot', column=0, low=-4, high=4)}
-    """
-    if outside is not None and not isinstance(outside, Mapping):
-        raise ConfigError(f"'outside' must have the form {_FORM}; got {outside!r}.")
-    ranges = {}
-    for name, row in (outside or {}).items():
-        full = list(row) if isinstance(row, list | tuple) else []
-        if len(full) == 3:
-            full = [full[0], 0, *full[1:]] if isinstance(full[0], str) else ["observation", *full]
-        if not _is_range(full):
-            raise ConfigError(f"'outside' must have the form {_FORM}; got {name}: {row!r}.")
-        kept = CostRange(full[0], int(full[1]), *full[2:])
-        if not kept.low <= kept.high or (math.isinf(kept.low) and math.isinf(kept.high)):
-            raise ConfigError(f"'outside': {name} cannot have the range {kept.low} to {kept.high}.")
-        if not is_cost(name):
-            raise ConfigError(f"'outside': costs are called cost or cost_<kind>, not '{name}'.")
-        ranges[name] = kept
-    return ranges
-
-
-def _is_range(row: list[Any]) -> bool:
-    """Whether a row is an entry, a column and two numbers."""
-    numbers = row[1:]
-    are_numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
-    if len(row) != 4 or not isinstance(row[0], str) or not are_numbers:
-        return False
-    return numbers[0] >= 0 and numbers[0] % 1 == 0

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 from torchrl.envs import GymWrapper
 
-from safe_rl.envs.families import FOREIGN, complete_foreign
+from safe_rl.envs.foreign import FOREIGN, complete_foreign
 from safe_rl.envs.gymnasium.gymnasium_env import (
     CostIntoInfo,
     CostReader,
@@ -82,8 +82,8 @@ def from_gymnasium(
     checked("num_envs", Count, num_envs)
     make = _maker(env, kwargs, num_steps)
     keys, length = _describe(make, cost_keys, num_steps, outside)
-    config = {"cost_keys": keys, "num_steps": length, "outside": outside, "flatten": flatten}
-    config["privileged"] = privileged
+    config = {"cost_keys": keys, "num_steps": length, "outside": outside}
+    config |= {"flatten": flatten, "privileged": privileged}
     return _batch(make, config, num_envs, seed, device, watch=cost_keys is None)
 
 
@@ -97,19 +97,18 @@ def _batch(
     watch: bool = True,
 ) -> GymnasiumEnv:
     """Make N environments; with `watch`, there is a warning about costs that are not counted."""
-    keys, length = [*dict.fromkeys(config["cost_keys"])], config["num_steps"]
-    privileged, flatten = config.get("privileged"), config.get("flatten", True)
+    whole = {"outside": None, "cost": None, "privileged": None, "flatten": True, **config}
+    keys = whole["cost_keys"] = [*dict.fromkeys(config["cost_keys"])]
     # a dictionary keeps its entries until the privileged one is taken out
-    is_vector = flatten and privileged is None
-    make_one = partial(make_adapted, make, length, is_vector, keys, watch)
+    is_vector = whole["flatten"] and whole["privileged"] is None
+    make_one = partial(make_adapted, make, whole["num_steps"], is_vector, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = _PartlyReset(worlds, device=torch.device(device), categorical_action_encoding=True)
     entries = list(map(dotted, base.observation_spec.keys(True, True)))
-    observed = [name for name in entries if name != privileged]
-    base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
-    whole = {"outside": None, "cost": None, **config, "observe": observed, "flatten": flatten}
-    batch = GymnasiumEnv(base, {**whole, "cost_keys": keys, "privileged": privileged})
+    whole["observe"] = [name for name in entries if name != whole["privileged"]]
+    base.set_info_dict_reader(CostReader(keys, num_envs, patience=whole["num_steps"]))
+    batch = GymnasiumEnv(base, whole)
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
 
@@ -193,7 +192,6 @@ def _make_node(
     config = complete_foreign(FOREIGN[family], config)
     make = maker(config)
     try:
-        checked("num_envs", Count, num_envs)
         return _batch(make, config, num_envs, None if seed is None else spread_seed(seed), device)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error

@@ -31,7 +31,7 @@ from torchrl.envs import (
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import ConstrainedEnv, bounds_of
-from safe_rl.envs.families import FOREIGN, complete_foreign
+from safe_rl.envs.foreign import FOREIGN, complete_foreign
 from safe_rl.envs.keys import ConfigError, is_cost
 from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed

@@ -15,7 +15,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import add_columns
-from safe_rl.envs.keys import COST, ConfigError, is_cost, parse_ranges
+from safe_rl.envs.foreign import parse_ranges
+from safe_rl.envs.keys import COST, ConfigError, is_cost
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import locate
 
