@@ -5,13 +5,6 @@ events such as `info["goal_met"]`. `gymnasium.make` and `gymnasium.make_vec` kno
 by the ids that `safe_rl.envs.families` registers.
 """
 
-from typing import TYPE_CHECKING
-
-from safe_rl.extras import import_later
-
-if TYPE_CHECKING:
-    from safe_rl.envs.gymnasium.conversion import make_gymnasium, make_safety_gymnasium
+from safe_rl.envs.gymnasium.conversion import make_gymnasium, make_safety_gymnasium
 
 __all__ = ["make_gymnasium", "make_safety_gymnasium"]
-
-__getattr__, __dir__ = import_later(__name__, {"conversion": __all__})

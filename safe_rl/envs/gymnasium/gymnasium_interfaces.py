@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -15,7 +14,6 @@ from safe_rl.envs.gymnasium.world_arrays import (
     Config,
     Observation,
     Worlds,
-    batch_of,
     choose,
     final_infos,
     take,
@@ -56,7 +54,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012
 
     def __init__(self, name: str | None = None, config: Config = None, **settings: Any) -> None:
-        self._open(partial(batch_of, name, config, 1, 1, None), **settings)
+        self._open(name, config, 1, 1, None, **settings)
         self.observation_space, self.action_space = self.spaces()
 
     def reset(
@@ -136,8 +134,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         **settings: Any,
     ) -> None:
-        make = partial(batch_of, name, config, num_envs, num_threads, max_episode_steps)
-        self._open(make, **settings)
+        self._open(name, config, num_envs, num_threads, max_episode_steps, **settings)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = self.spaces()

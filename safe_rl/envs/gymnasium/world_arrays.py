@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import gymnasium
@@ -54,7 +53,12 @@ class Worlds:
 
     def _open(
         self,
-        batch: partial[SimulatedEnv],
+        name: str | None,
+        config: Config,
+        num_envs: int,
+        num_threads: int,
+        num_steps: int | None,
+        /,
         *,
         render_mode: str | None = None,
         camera: Any = None,
@@ -65,16 +69,17 @@ class Worlds:
         **unknown: Any,
     ) -> None:
         if unknown:
-            name = next(iter(unknown))
-            other = f"put keys of the configuration into config={{'{name}': …}}"
+            key = next(iter(unknown))
+            other = f"put keys of the configuration into config={{'{key}': …}}"
             # TorchRL's `GymEnv` tries an argument `frameskip`, and looks for these words
             raise TypeError(
-                f"{type(self).__name__} got an unexpected keyword argument '{name}': "
-                f"{_ELSEWHERE.get(name, other)}."
+                f"{type(self).__name__} got an unexpected keyword argument '{key}': "
+                f"{_ELSEWHERE.get(key, other)}."
             )
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
-        self.batch, self.render_mode, self._has_positions = batch(sleep), render_mode, positions
+        self.batch = batch_of(name, config, num_envs, num_threads, num_steps, sleep)
+        self.render_mode, self._has_positions = render_mode, positions
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self._episode_cost = np.zeros(self.batch.batch_size.numel())  # since the last reset
         rate = max(1, round(1 / self.batch.seconds_per_step))  # of real time
