@@ -225,4 +225,4 @@ class Checked:
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if "__init__" in vars(cls):
-            cls.__init__ = checked(vars(cls)["__init__"])  # type: ignore[method-assign]
+            checked(cls)

@@ -82,8 +82,6 @@ def import_later(
         return getattr(import_module(modules[name]), name)
 
     def names() -> list[str]:
-        own = vars(sys.modules[package])
-        special = {name for name in own if name.startswith("__")}
-        return sorted({*special, *own.get("__all__", ()), *modules})
+        return sorted({*vars(sys.modules[package]), *modules})
 
     return find, names

@@ -17,21 +17,20 @@ from safe_rl.envs.extending import (
     register_element,
 )
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import ROBOTS, registered_keys, set_registered_keys
+from safe_rl.envs.safety_gym.config import KEYS, ROBOTS
 from safe_rl.envs.safety_gym.costs import COSTS
 from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
 from safe_rl.envs.safety_gym.observations import READINGS
 from safe_rl.envs.safety_gym.tasks import TASKS
 
 LISTS = (COSTS, ELEMENTS, PLACEMENT_ORDER, READINGS)
-MAPPINGS = (BY_KIND, ROBOTS, TASKS)
+MAPPINGS = (BY_KIND, KEYS, ROBOTS, TASKS)
 
 
 @contextmanager
 def undone() -> Iterator[None]:
     """Undo every registration at the end."""
     lists, mappings = [list(table) for table in LISTS], [dict(table) for table in MAPPINGS]
-    keys = registered_keys()
     try:
         yield
     finally:
@@ -40,7 +39,6 @@ def undone() -> Iterator[None]:
         for table, rows in zip(MAPPINGS, mappings, strict=True):
             table.clear()
             table.update(rows)
-        set_registered_keys(keys)
         store_configs()  # the keys that Hydra knows
         forget_scenes()
 

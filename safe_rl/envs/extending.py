@@ -15,13 +15,7 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.envs.keys import ConfigError, Key
 from safe_rl.envs.safety_gym.building import forget_scenes
-from safe_rl.envs.safety_gym.config import (
-    KEYS,
-    ROBOTS,
-    infer_key,
-    registered_keys,
-    set_registered_keys,
-)
+from safe_rl.envs.safety_gym.config import KEYS, ROBOTS, infer_key, register_keys
 from safe_rl.envs.safety_gym.config_keys import Locations, Objects, Placements
 from safe_rl.envs.safety_gym.costs import (
     BUILT_IN_COSTS,
@@ -273,4 +267,4 @@ def _add_keys(given: Mapping[str, Any] | None, standard: Mapping[str, Key] | Non
             keys[name] = keys[name]._replace(default=value)
         else:
             keys[name] = infer_key(name, value)
-    set_registered_keys({**registered_keys(), **keys})
+    register_keys(keys)

@@ -9,6 +9,7 @@ libraries have one stream each. One generator per row would need a loop over row
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -61,6 +62,52 @@ def row_seeds(seed: int, num_rows: int, device: torch.device | None = None) -> T
     """Return one seed per row, int64 [num_rows]; row k is the same for every `num_rows`."""
     rows = torch.arange(num_rows, device=device)
     return fold(torch.full_like(rows, seed), rows)
+
+
+class DrawnAhead:
+    """Draws of N rows by their keys, made in advance and stored until they are needed.
+
+    A draw depends only on its key, and to make one takes about as long as to make a hundred. So
+    when a row begins an episode, those for the next episodes of the other rows are made too. They
+    need not be part of a saved state.
+
+    Args:
+        draw: Makes the draws of keys, int64 [B] -> [B, …]; raises a ValueError if there is none for
+            one of the keys.
+        shape: N, …
+        device: Device of the keys.
+    """
+
+    def __init__(
+        self,
+        draw: Callable[[Tensor], Tensor],
+        shape: Sequence[int],
+        device: torch.device | None = None,
+    ) -> None:
+        self._draw = draw
+        self._known = torch.zeros(shape[0], dtype=torch.bool, device=device)
+        self._keys = torch.zeros(shape[0], dtype=torch.int64, device=device)
+        self._drawn = torch.zeros(*shape, dtype=torch.float64, device=device)
+
+    def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
+        """Return draws [N, …] that are valid in the rows of a mask.
+
+        Args:
+            key: Keys of the draws of the present episodes, int64 [N].
+            following: Keys of those of the next episodes, int64 [N].
+            mask: Rows that begin an episode, bool [N].
+        """
+        if (((self._keys != key) | ~self._known) & mask).any():
+            wanted = torch.where(mask, key, following)
+            rows = (self._keys != wanted) | ~self._known
+            try:
+                drawn = self._draw(wanted[rows])
+            except ValueError:
+                # The missing draw may be that of a next episode, which perhaps never begins.
+                rows &= mask
+                drawn = self._draw(wanted[rows])
+            self._drawn[rows], self._keys[rows], self._known[rows] = drawn, wanted[rows], True
+        return self._drawn
 
 
 def spread_seed(seed: int) -> int:

@@ -66,26 +66,26 @@ class SimulatedEnv(ConstrainedEnv):
         self._physics_settings: tuple[Any, ...] = (num_threads,)
 
     def _make_physics(
-        self, model: mujoco.MjModel, num_threads: int, outputs: Sequence[str] = OUTPUTS
+        self,
+        model: mujoco.MjModel,
+        bodies: slice,
+        num_threads: int,
+        outputs: Sequence[str] = OUTPUTS,
     ) -> Physics:
+        """Build the physics; `bodies` are the ids of the robot's bodies."""
+        scales = {key: getattr(self.config, key) for key in SCALES}
+        ranges = {key: value for key, value in scales.items() if isinstance(value, tuple)}
         if self.config.physics == "cpu":
-            return BatchPhysics(model, self.batch_size[0], num_threads, outputs)
-        if ranges := self._ranges():  # before the physics, which takes seconds to build
+            physics = BatchPhysics(model, self.batch_size[0], num_threads, outputs)
+            if ranges:
+                self._dynamics = DrawnDynamics(model, physics.batch, ranges, bodies)
+            return physics
+        if ranges:  # before the physics, which takes seconds to build
             raise ConfigError(
                 f"'{next(iter(ranges))}' is a range, which 'physics' warp does not have: use "
                 "'physics' cpu, or one factor."
             )
         return make_warp_physics(self, model, outputs)
-
-    def _draw_dynamics(self, model: mujoco.MjModel, bodies: slice) -> None:
-        """Prepare the drawing of factors; `bodies` are the ids of the robot's bodies."""
-        if (ranges := self._ranges()) and isinstance(self._physics, BatchPhysics):
-            self._dynamics = self._physics.draw_dynamics(model, ranges, bodies)
-
-    def _ranges(self) -> dict[str, tuple[float, float]]:
-        """Keys that scale the dynamics by factors drawn from a range."""
-        scales = {key: getattr(self.config, key) for key in SCALES}
-        return {key: value for key, value in scales.items() if isinstance(value, tuple)}
 
     def _announce(
         self, model: mujoco.MjModel, observation: TensorSpec, highest: float, seed: int | None
@@ -195,6 +195,10 @@ class SimulatedEnv(ConstrainedEnv):
                 f"'action' must be a floating-point tensor of shape {tuple(needed)} (num_envs, "
                 f"number of actuators), got {action.dtype} {tuple(action.shape)}."
             )
+        if not self._all_begun:
+            rows = (~self._begun).nonzero()[:, 0].tolist()
+            which = f" of rows {rows}" if self._begun.any() else ""
+            raise ResetNeededError(f"No episode has begun{which}: call reset() before a step.")
         return action.detach().to(self._physics.device)
 
     @abstractmethod
@@ -304,14 +308,6 @@ class SimulatedEnv(ConstrainedEnv):
 
 class ResetNeededError(RuntimeError):
     """A step was taken before the first reset."""
-
-
-def require_episodes(begun: Tensor) -> None:
-    """Raise ResetNeededError unless every row has begun an episode, `begun` [N]."""
-    if not begun.all():
-        rows = (~begun).nonzero()[:, 0].tolist()
-        which = "" if not begun.any() else f" of rows {rows}"
-        raise ResetNeededError(f"No episode has begun{which}: call reset() before the first step.")
 
 
 def check_state(expected: TensorDictBase, state: TensorDictBase, optional: Collection[str]) -> None:

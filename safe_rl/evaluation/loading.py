@@ -54,7 +54,7 @@ def keep_robot(run: Run, env: Mapping[str, Any]) -> None:
 
     If the files cannot be copied, the note has their hash only, and the reason is printed.
     """
-    robot = _own_robot(env)
+    robot = own_robot(env)
     if robot is None:
         return
     shutil.rmtree(run.robot_folder, ignore_errors=True)
@@ -83,7 +83,7 @@ def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
         raise ConfigError(f"{run.robot_file} is not as a run writes it.")
     if note["robot_base"] != env.get("robot_base"):
         return dict(env)
-    original, content = _own_robot(env), note["sha256"]
+    original, content = own_robot(env), note["sha256"]
     path = run.robot_folder / str(note["file"]) if note["file"] else original
     if path is None or not path.is_file():
         raise ConfigError(f"'robot_base': there is no file {path}, with which the run began.")
@@ -104,11 +104,6 @@ def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:
     """`safe_rl.make_env` for a run's environments, with the robot that it began with."""
     run = Run(directory)
     return lambda env, **options: make_env(robot_of(run, env), **options)
-
-
-def _own_robot(env: Mapping[str, Any]) -> Path | None:
-    """The user's robot file, if any; environments of other families have none."""
-    return own_robot(env) if env.get("_target_") is None and "robot_base" in env else None
 
 
 def load_policy(

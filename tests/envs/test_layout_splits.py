@@ -6,7 +6,7 @@ from scipy.stats import chisquare
 from tensordict import TensorDict
 
 from safe_rl.envs import LayoutError, SafetyGymEnv, resolve
-from safe_rl.envs.safety_gym.episodes import LayoutsAhead
+from safe_rl.envs.rng import DrawnAhead
 
 # What a layout pins: positions, yaws, the first goal button.
 PINNED = ("layout", "start_pose", "qpos", "goal_pos", "goal_button", "target_quat")
@@ -88,7 +88,7 @@ def mask_of(*rows):
 
 
 def test_an_episode_that_may_never_come_has_no_say():
-    layouts = LayoutsAhead(draw, num_envs=3, num_columns=1)
+    layouts = DrawnAhead(draw, (3, 1, 2))
     key = torch.tensor([1, 2, 3])
     assert layouts(key, torch.tensor([4, 5, 500]), mask_of(0))[0].tolist() == [[1, 1]]
     assert layouts(key, key, mask_of(1))[1].tolist() == [[2, 2]]

@@ -73,7 +73,7 @@ class WaitingPhysics(Physics):
 
 def waiting(config, dtype=torch.float64, base=SafetyGymEnv, **arguments):
     class Env(base):
-        def _make_physics(self, model, num_threads, outputs=OUTPUTS):
+        def _make_physics(self, model, bodies, num_threads, outputs=OUTPUTS):
             return WaitingPhysics(model, self.batch_size[0], dtype, outputs)
 
     return Env(config, **arguments)

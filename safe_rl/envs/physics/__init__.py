@@ -16,10 +16,10 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from safe_rl.envs.physics.dynamics import DrawnDynamics
-
 STATE = ("time", "qpos", "qvel", "qacc_warmstart", "ctrl", "mocap_pos", "mocap_quat")
 """Tensors of the state, besides that of actuators and sensors."""
+RESTORED = ("qpos", "qvel", "qacc_warmstart", "time")
+"""Those of them that every stored state of an environment contains."""
 ACTUATOR_STATE = ("act", "history")
 OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
 
@@ -166,6 +166,9 @@ class BatchPhysics(Physics):
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
         outputs: Names of the fields of `MjData` that are read; every call copies them.
+
+    Attributes:
+        batch: MuJoCo's simulations.
     """
 
     device = torch.device("cpu")
@@ -187,14 +190,14 @@ class BatchPhysics(Physics):
         has_threads = (num_threads or os.cpu_count() or 1) > 1
         self._process = os.getpid() if has_threads else None
         self.timestep = float(model.opt.timestep)
-        self._batch = Batch(model, num_envs, num_threads, persistent=sleeps)
+        self.batch = Batch(model, num_envs, num_threads, persistent=sleeps)
         # All fields are bound before the first call: a field that is bound later starts as zero.
         sizes = zip(ACTUATOR_STATE, (model.na, model.nhistory), strict=True)
         delayed = [name for name, size in sizes if size]
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
             bound = {
-                name: torch.from_numpy(self._batch.bind(name))
+                name: torch.from_numpy(self.batch.bind(name))
                 for name in (*STATE, *delayed, *outputs)
             }
         for name in STATE:
@@ -205,22 +208,16 @@ class BatchPhysics(Physics):
             self.outputs["xmat"] = self.outputs["xmat"].view(num_envs, model.nbody, 3, 3)
         for name in set(OUTPUTS).intersection(outputs):
             setattr(self, name, self.outputs[name])
-        self._disableflags = self._batch.expand("opt.disableflags")
+        self._disableflags = self.batch.expand("opt.disableflags")
         self._with_sensors = int(model.opt.disableflags)
-        self._warnings = np.zeros_like(self._batch.warning)
+        self._warnings = np.zeros_like(self.batch.warning)
         self._num_failures, self._all_failed = 0, 0
-
-    def draw_dynamics(
-        self, model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]], bodies: slice
-    ) -> DrawnDynamics:
-        """Give every simulation dynamics of its own, see `DrawnDynamics`."""
-        return DrawnDynamics(model, self._batch, ranges, bodies)
 
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` to the model's initial state, see `Physics`."""
         self._check_process()
-        self._batch.reset(mask.numpy(), stage=_NO_STAGE)
-        self._warnings[:] = self._batch.warning
+        self.batch.reset(mask.numpy(), stage=_NO_STAGE)
+        self._warnings[:] = self.batch.warning
 
     def forward(self, mask: Tensor | None = None, sensors: bool = True) -> None:
         """Compute the outputs from the state, see `Physics`.
@@ -229,7 +226,7 @@ class BatchPhysics(Physics):
         """
         self._check_process()
         self._disableflags[:] = self._with_sensors | (0 if sensors else _NO_SENSORS)
-        self._batch.forward(None if mask is None else mask.numpy())
+        self.batch.forward(None if mask is None else mask.numpy())
         self._disableflags[:] = self._with_sensors
 
     def step(
@@ -250,13 +247,13 @@ class BatchPhysics(Physics):
                 self._substeps(count, mocap_path, (counts == count).numpy())
         self._disableflags[:] = self._with_sensors
         if refresh:
-            self._batch.forward()
+            self.batch.forward()
         return self.failed()
 
     def failed(self) -> Tensor:
         """Return the simulations that failed since the last call of this or `step`, bool [N]."""
         # MuJoCo resets a bad state by itself, and only increments a warning counter.
-        counts = self._batch.warning
+        counts = self.batch.warning
         if np.array_equal(counts, self._warnings):
             self._all_failed = 0
             return torch.zeros(len(counts), dtype=torch.bool, device=self.device)
@@ -288,7 +285,7 @@ class BatchPhysics(Physics):
         """Cast rays into the simulations as their state is now, see `Physics`."""
         seen = np.zeros(mujoco.mjNGROUP, dtype=np.uint8)
         seen[group] = 1
-        distance, _ = self._batch.ray(
+        distance, _ = self.batch.ray(
             origin.numpy()[:, None], directions.numpy(), geomgroup=seen, bodyexclude=exclude_body
         )
         return torch.from_numpy(distance)
@@ -306,9 +303,9 @@ class BatchPhysics(Physics):
         if count == 0:
             return
         if path is None:
-            self._batch.rollout(count, record=(), ids=mask)
+            self.batch.rollout(count, record=(), ids=mask)
             return
         rows = slice(None) if mask is None else torch.from_numpy(mask)
         moved = path[rows, :count].flatten(2)
         control = torch.cat([self.ctrl[rows, None].expand(-1, count, -1), moved], -1)
-        self._batch.rollout(count, control.numpy(), _PATH_INPUTS, record=(), ids=mask)
+        self.batch.rollout(count, control.numpy(), _PATH_INPUTS, record=(), ids=mask)

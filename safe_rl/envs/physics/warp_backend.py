@@ -59,7 +59,7 @@ def most_contacts(config: Any, env_class: Any) -> tuple[int, int]:
 
     class Trial(env_class):
         def _make_physics(
-            self, model: mujoco.MjModel, num_threads: int, outputs: Sequence[str] = OUTPUTS
+            self, model: mujoco.MjModel, bodies: slice, num_threads: int, outputs: Any = OUTPUTS
         ) -> Physics:
             model = copy.copy(model)
             model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)

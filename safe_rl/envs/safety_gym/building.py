@@ -28,7 +28,7 @@ from safe_rl.envs.safety_gym.elements import (
 )
 from safe_rl.envs.safety_gym.observations import active_readings
 from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot
-from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
+from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Scene
 from safe_rl.naming import did_you_mean
 
@@ -161,7 +161,7 @@ def _add_targets(
 
 def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
     """Whether an area has a shape; the goal of a button task has none, but its button has."""
-    stands_in = element.kind == "goal" and goal_is_button(config.task)
+    stands_in = element.kind == "goal" and TASKS[config.task].goal_at_button
     return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 
 

@@ -123,13 +123,8 @@ def key_table() -> list[KeyRow]:
     ]
 
 
-def registered_keys() -> dict[str, Key]:
-    """Return the keys that are not built in."""
-    return {name: row for name, row in KEYS.items() if name not in _BUILT_IN}
-
-
-def set_registered_keys(keys: Mapping[str, Key]) -> None:
-    """Set the keys that exist in addition to the built-in ones.
+def register_keys(keys: Mapping[str, Key]) -> None:
+    """Add keys to the built-in ones.
 
     Raises:
         ConfigError: If a key is built in, or a default does not have the type of its key.
@@ -138,5 +133,4 @@ def set_registered_keys(keys: Mapping[str, Key]) -> None:
         if name in _BUILT_IN:
             raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
         checked(name, row.annotation, row.default)
-    KEYS.clear()
-    KEYS.update({**_BUILT_IN, **keys})
+    KEYS.update(keys)

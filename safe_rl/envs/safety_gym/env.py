@@ -17,7 +17,6 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
 from safe_rl.envs.safety_gym.episodes import (
     OPTIONAL_KEYS,
-    LayoutsAhead,
     Purpose,
     control_noise,
     draw_layouts,
@@ -36,8 +35,8 @@ from safe_rl.envs.safety_gym.layouts import plan_placements
 from safe_rl.envs.safety_gym.observations import Privileged, make_observer, observation_spec
 from safe_rl.envs.safety_gym.renderer import WorldRenderer, vision_block
 from safe_rl.envs.safety_gym.suite import resolve
-from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward, goal_is_button
-from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
+from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward
+from safe_rl.envs.simulated import SimulatedEnv, check_state
 
 _LIDAR = ("lidar_type", "lidar_max_dist", "lidar_exp_gain", "lidar_alias")
 
@@ -105,12 +104,14 @@ class SafetyGymEnv(SimulatedEnv):
         self._physics_settings += (sleep,)
         self.config = resolve(env)
         scene = build_scene(self.config, sleep and self.config.physics == "cpu")
-        self._physics = physics = self._make_physics(scene.model, num_threads)
+        bodies = slice(1, scene.free_bodies.start)
+        self._physics = physics = self._make_physics(scene.model, bodies, num_threads)
         self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
         self._world = make_world(scene, self._physics)
         self._plan = plan_placements(scene, physics.device)
         draw = partial(draw_layouts, self._plan, physics)
-        self._layouts = LayoutsAhead(draw, num_envs, self._plan.num_columns, physics.device)
+        shape = (num_envs, self._plan.num_columns, 2)
+        self._layouts = rng.DrawnAhead(draw, shape, physics.device)
         vision = [vision_block(scene)] if self.config.observe_vision else []
         self._observer = make_observer(scene, physics.device, vision)
         self._task = TASKS[self.config.task]
@@ -124,7 +125,6 @@ class SafetyGymEnv(SimulatedEnv):
             self._remembered = self._privileged.past
         observed = observation_spec(self.config, self._observer, num_envs, self.device)
         highest = 1.0 if self.config.constrain_indicator else torch.finfo(torch.float32).max
-        self._draw_dynamics(scene.model, slice(1, scene.free_bodies.start))
         self._announce(scene.model, observed, highest, seed)
 
     @property
@@ -146,20 +146,19 @@ class SafetyGymEnv(SimulatedEnv):
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
         if seed is not None:
-            # The layout of all rows if `randomize_layout` is False.
-            device = self._physics.device
-            self._fixed_layout = rng.fold(torch.tensor(seed, device=device), Purpose.LAYOUT)
+            self._fixed_layout = self._layout_of(seed)
 
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world and its layout separately, [N]; None keeps the seed of a world."""
         super().set_row_seeds(seeds)
         self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
-        device = self._physics.device
         for row, seed in enumerate(seeds):
             if seed is not None:
-                self._fixed_layout[row] = rng.fold(
-                    torch.tensor(seed, device=device), Purpose.LAYOUT
-                )
+                self._fixed_layout[row] = self._layout_of(seed)
+
+    def _layout_of(self, seed: int) -> Tensor:
+        """Return the layout key of all rows of a seed, if `randomize_layout` is False."""
+        return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
         """Return random keys of the layouts of the `ahead`-th next episodes, [N]."""
@@ -196,8 +195,6 @@ class SafetyGymEnv(SimulatedEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         world, config = self._world, self.config
         action = self._checked_action(tensordict)
-        if not self._all_begun:
-            require_episodes(self._begun)
         failed = self._advance(action)
         now = self._task.measure(world)
         reward = dense_reward(self._task, world, self._measured, now, failed)
@@ -278,7 +275,7 @@ class SafetyGymEnv(SimulatedEnv):
     def _write_state(self, state: TensorDictBase) -> None:
         check_state(self.get_state(), state, (*OPTIONAL_KEYS, *self._remembered))
         button, number = state["goal_button"], self.config.buttons_num
-        if goal_is_button(self.config.task) and not ((button >= 0) & (button < number)).all():
+        if self._task.goal_at_button and not ((button >= 0) & (button < number)).all():
             raise ValueError(f"State 'goal_button' must be between 0 and {number - 1}: {button}.")
         self._fixed_layout = state.get("fixed_layout", self._fixed_layout).clone()
         if "layout" not in state and not self._episode.any():
@@ -292,7 +289,7 @@ class SafetyGymEnv(SimulatedEnv):
                 tensor.copy_(state[key])
         physics.mocap_quat[:, : scene.num_targets] = target_quat
         world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
-        if goal_is_button(scene.config.task):
+        if self._task.goal_at_button:
             point_goal_at_button(world, everywhere)
         elif "goal" in scene.slots:
             goal = scene.slots["goal"].start

@@ -7,7 +7,6 @@ The key of every random draw is made of the row's seed, the episode, the step an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import Physics, put
+from safe_rl.envs.physics import RESTORED, Physics, put
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.layouts import (
     LayoutError,
@@ -23,7 +22,7 @@ from safe_rl.envs.safety_gym.layouts import (
     resample_goal,
     sample_layouts,
 )
-from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
+from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Scene, World
 
 
@@ -40,7 +39,6 @@ class Purpose(IntEnum):
     FIRST_GOAL = -1  # differs from all step numbers, which are in the same place of a key
 
 
-PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
 SEED_KEYS = ("fixed_layout", "seed", "episode")  # of the environment, not of its worlds
@@ -51,7 +49,7 @@ OPTIONAL_KEYS = (*LAYOUT_KEYS, *SEED_KEYS, "target_quat", "ctrl", "act", "histor
 def stored_tensors(world: World) -> dict[str, Tensor]:
     """Return the tensors that a state contains unchanged, by key."""
     return {
-        **{key: getattr(world.physics, key) for key in (*PHYSICS_KEYS, "ctrl")},
+        **{key: getattr(world.physics, key) for key in (*RESTORED, "ctrl")},
         **{key: getattr(world, key) for key in (*TASK_KEYS, *LAYOUT_KEYS)},
         **world.physics.actuator_state,
     }
@@ -189,57 +187,6 @@ def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     return layouts
 
 
-class LayoutsAhead:
-    """Layouts by their keys, drawn in advance and stored until they are needed.
-
-    A layout depends only on its key, and to draw one layout takes about as long as to draw a
-    hundred. So when a row begins an episode, the next layouts of the other rows are drawn too. They
-    need not be part of a saved state.
-
-    Args:
-        draw: Draws the layouts of keys, int64 [B] -> [B, 1 + M, 2]; raises `LayoutError` if there
-            is none for one of the keys.
-        num_envs: Number of rows, N.
-        num_columns: 1 + M.
-        device: Device of the keys.
-    """
-
-    def __init__(
-        self,
-        draw: Callable[[Tensor], Tensor],
-        num_envs: int,
-        num_columns: int,
-        device: torch.device | None = None,
-    ) -> None:
-        self._draw = draw
-        self._known = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._keys = torch.zeros(num_envs, dtype=torch.int64, device=device)
-        self._layouts = torch.zeros(num_envs, num_columns, 2, dtype=torch.float64, device=device)
-
-    def __call__(self, key: Tensor, following: Tensor, mask: Tensor) -> Tensor:
-        """Return layouts [N, 1 + M, 2] that are valid in the rows of a mask.
-
-        Args:
-            key: Keys of the layouts of the present episodes, int64 [N].
-            following: Keys of the layouts of the next episodes, int64 [N].
-            mask: Rows that begin an episode, bool [N].
-
-        Raises:
-            LayoutError: If there is no layout; the message names the object that did not fit.
-        """
-        if (((self._keys != key) | ~self._known) & mask).any():
-            wanted = torch.where(mask, key, following)
-            rows = (self._keys != wanted) | ~self._known
-            try:
-                drawn = self._draw(wanted[rows])
-            except LayoutError:
-                # The missing layout may be that of a next episode, which perhaps never begins.
-                rows &= mask
-                drawn = self._draw(wanted[rows])
-            self._layouts[rows], self._keys[rows], self._known[rows] = drawn, wanted[rows], True
-        return self._layouts
-
-
 def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> None:
     """Set the worlds of a mask, bool [N], to the initial state of a new episode.
 
@@ -270,7 +217,7 @@ def start_episodes(world: World, layouts: Tensor, key: Tensor, mask: Tensor) -> 
         put(physics.mocap_quat[:, : scene.num_targets], mask, quaternion)
     static = world.positions[:, scene.num_free :, :2]
     put(static, mask, world.layout[:, 1 + scene.num_free :])
-    if goal_is_button(scene.config.task):
+    if TASKS[scene.config.task].goal_at_button:
         _choose_button(world, rng.fold(key, Purpose.BUTTON), mask)
     world.step_count.masked_fill_(mask, 0)
     world.buttons_timer.masked_fill_(mask, 0)
@@ -294,7 +241,7 @@ def next_goals(world: World, plan: PlacementPlan, key: Tensor, mask: Tensor) -> 
     """
     config, physics = world.scene.config, world.physics
     world.buttons_timer.masked_fill_(mask, config.buttons_resampling_delay)
-    if goal_is_button(config.task):
+    if TASKS[config.task].goal_at_button:
         _choose_button(world, rng.fold(key, Purpose.BUTTON), mask)
         return torch.zeros_like(mask)
     goal_key, column = rng.fold(key, Purpose.GOAL), plan.goal_column

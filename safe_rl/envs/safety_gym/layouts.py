@@ -17,7 +17,7 @@ from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics import Physics
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BY_KIND, PLACEMENT_ORDER
-from safe_rl.envs.safety_gym.tasks import goal_is_button
+from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Scene
 
 _Rectangle = tuple[float, float, float, float]  # xmin, ymin, xmax, ymax
@@ -63,7 +63,7 @@ def plan_placements(scene: Scene, device: torch.device) -> PlacementPlan:
     for kind in PLACEMENT_ORDER:
         if kind == "robot":
             labels, first = ["robot"], 0
-        elif kind not in scene.slots or (kind == "goal" and goal_is_button(config.task)):
+        elif kind not in scene.slots or (kind == "goal" and TASKS[config.task].goal_at_button):
             continue
         else:
             labels, first = BY_KIND[kind].names(config), 1 + scene.slots[kind].start

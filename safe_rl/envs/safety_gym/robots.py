@@ -197,9 +197,11 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
     return True
 
 
-def own_robot(keys: Mapping[str, Any]) -> Path | None:
-    """Return the file of the robot in a mapping of keys; None for a bundled robot."""
-    base = str(keys.get("robot_base", "car"))
+def own_robot(node: Mapping[str, Any]) -> Path | None:
+    """Return the user's robot file that a node names; other families than Safety Gym have none."""
+    if node.get("_target_") is not None or "robot_base" not in node:
+        return None
+    base = str(node["robot_base"])
     path = ROBOTS.get(base, Path(base))
     is_bundled = path.parent == BUNDLED or (base in PATHS_OF_2019 and not path.is_file())
     return None if is_bundled else path

@@ -15,7 +15,7 @@ from typing import Any
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import PATHS_OF_2019, ROBOTS, SafetyGymConfig
 from safe_rl.envs.safety_gym.config_keys import LARGEST_SEED
-from safe_rl.envs.safety_gym.tasks import TASKS, goal_is_button
+from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.naming import did_you_mean
 
 Values = dict[str, Any]
@@ -161,10 +161,8 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     named = SUITE | EXTRAS
     if name not in named:
         raise ConfigError(
-            f"Unknown environment '{env}'.{did_you_mean(name, named)} The suite has "
-            "{Point, Car, Doggo}{Goal, Button, Push}{0, 1, 2}, for example 'PointGoal1'; beyond it "
-            "there are {Point, Car, Doggo}{Run, Run1, Circle, Circle1, Circle2}, and {name}Vision "
-            "for each of them. safe_rl.envs.make_env makes all others, also yours."
+            f"Unknown environment '{env}'.{did_you_mean(name, named)} safe_rl.envs.env_names() "
+            "lists all; those of other families, and yours, are made by safe_rl.envs.make_env."
         )
     return SafetyGymConfig(**named[name])
 
@@ -194,7 +192,7 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
             f"'layout_seeds_first' and 'layout_seeds' together must be at most {LARGEST_SEED}, got "
             f"{config.layout_seeds_first} and {config.layout_seeds}."
         )
-    if goal_is_button(config.task) and config.buttons_num < 1:
+    if TASKS[config.task].goal_at_button and config.buttons_num < 1:
         raise ConfigError(f"'task' {config.task} needs at least one button: set 'buttons_num'.")
     if config.constrain_boundary and config.boundary_x is None and config.boundary_y is None:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")

@@ -116,11 +116,6 @@ TASKS: dict[str, Task] = {
 BUILT_IN_TASKS = frozenset(TASKS)
 
 
-def goal_is_button(task: str) -> bool:
-    """Whether the goal of a task is at the goal button."""
-    return TASKS[task].goal_at_button
-
-
 def dense_reward(task: Task, world: World, before: Tensor, now: Tensor, failed: Tensor) -> Tensor:
     """Return the reward [N] without the bonus for a goal, clipped to ±`reward_clip`.
 

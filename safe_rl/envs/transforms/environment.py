@@ -25,6 +25,11 @@ from safe_rl.naming import did_you_mean, key_name
 from safe_rl.trust import TargetError, instantiate
 
 _STATE = "transforms"
+# Attributes of the inner environment, which the defaults of `ConstrainedEnv` would hide.
+_INNER = (
+    *("max_episode_steps", "seconds_per_step", "events", "sensor_keys", "return_key"),
+    *("reuses_tensors", "steps_after_end", "privileged_layout"),
+)
 
 
 class ConstraintTransform(Checked, Transform):
@@ -150,15 +155,10 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self, base_env: ConstrainedEnv, transforms: Mapping[str, Transform], seed: int | None = None
     ) -> None:
         super().__init__(base_env, Compose(*transforms.values()))
-        self.max_episode_steps = base_env.max_episode_steps
-        self.seconds_per_step = base_env.seconds_per_step
-        self.events, self.sensor_keys = base_env.events, base_env.sensor_keys
+        for name in _INNER:
+            setattr(self, name, getattr(base_env, name))
         self._ours = {n: t for n, t in transforms.items() if isinstance(t, ConstraintTransform)}
         self.cost_keys = list(base_env.cost_keys)
-        self.return_key = base_env.return_key
-        self.reuses_tensors = base_env.reuses_tensors
-        self.steps_after_end = base_env.steps_after_end
-        self.privileged_layout = base_env.privileged_layout
         layout = dict(base_env.observation_layout)
         for name, transform in self._ours.items():
             try:

@@ -39,31 +39,20 @@ class Place(NamedTuple):
 
     Attributes:
         outputs: Outputs of the physics that it needs.
-        reading: Returns a function that reads its position [N, D] (m). D is 1 for a limit on the
-            velocity along x, and 2 for one on the planar speed.
+        read: (physics, shares of the bodies in the mass [nbody, 1]) -> its position [N, D] (m). D
+            is 1 for a limit on the velocity along x, and 2 for one on the planar speed.
     """
 
     outputs: tuple[str, ...]
-    reading: Callable[[mujoco.MjModel, Physics], Callable[[], Tensor]]
-
-
-def _x(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
-    return lambda: physics.qpos[:, :1].clone()
-
-
-def _torso(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
-    return lambda: physics.outputs["xpos"][:, TORSO, :2].clone()
-
-
-def _centre_of_mass(model: mujoco.MjModel, physics: Physics) -> Callable[[], Tensor]:
-    shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None].to(physics.qpos)
-    return lambda: (physics.outputs["xipos"][..., :2] * shares).sum(1)
+    read: Callable[[Physics, Tensor], Tensor]
 
 
 PLACES: Mapping[str, Place] = {
-    "x": Place((), _x),
-    "torso": Place(("xpos",), _torso),
-    "centre_of_mass": Place(("xipos",), _centre_of_mass),
+    "x": Place((), lambda p, shares: p.qpos[:, :1].clone()),
+    "torso": Place(("xpos",), lambda p, shares: p.outputs["xpos"][:, TORSO, :2].clone()),
+    "centre_of_mass": Place(
+        ("xipos",), lambda p, shares: (p.outputs["xipos"][..., :2] * shares).sum(1)
+    ),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import mujoco
@@ -13,9 +13,9 @@ from torch import Tensor
 from torchrl.data import Unbounded
 
 from safe_rl.envs import rng
-from safe_rl.envs.physics import BatchPhysics, put
+from safe_rl.envs.physics import RESTORED, BatchPhysics, put
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
-from safe_rl.envs.simulated import SimulatedEnv, check_state, require_episodes
+from safe_rl.envs.simulated import SimulatedEnv, check_state
 from safe_rl.envs.velocity.runner import (
     FORCES,
     HEALTH,
@@ -29,7 +29,6 @@ from safe_rl.envs.velocity.runner import (
 )
 from safe_rl.envs.velocity.velocity_config import RUNNERS, VelocityConfig, resolve_velocity
 
-_PHYSICS_KEYS = ("qpos", "qvel", "qacc_warmstart", "time")
 _OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
@@ -83,28 +82,31 @@ class VelocityEnv(SimulatedEnv):
         super().__init__(num_envs, device, num_threads)
         self.config = resolve_velocity(env)
         self.cost_keys = ["cost", "cost_velocity"]
-        self._model = load_model(self.config)
+        self._model = model = load_model(self.config)
         outputs = needed_outputs(self.config)
-        self._physics = physics = self._make_physics(self._model, num_threads, outputs)
-        self.seconds_per_step = self._physics.timestep * self.config.frame_skip
-        self._observer = Observer(self.config, self._model)
+        bodies = slice(1, model.nbody)
+        self._physics = physics = self._make_physics(model, bodies, num_threads, outputs)
+        self.seconds_per_step = physics.timestep * self.config.frame_skip
+        self._observer = Observer(self.config, model)
+        shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
         place = PLACES[RUNNERS[self.config.robot].place]
-        self._place = place.reading(self._model, self._physics)
+        self._place = partial(place.read, physics, shares.to(physics.qpos))
         self._last_place = self._place()
         shape = (num_envs, self._observer.size)
         self._observation = torch.zeros(shape, dtype=torch.float32, device=physics.device)
         self._step_count = torch.zeros(num_envs, dtype=torch.int64, device=physics.device)
-        self._starts = Starts(self.config, self._model)
+        draw = partial(draw_start, self.config, model)
+        self._starts = rng.DrawnAhead(draw, (num_envs, model.nq + model.nv), physics.device)
         observed = Unbounded(shape, dtype=torch.float32, device=self.device)
-        self._draw_dynamics(self._model, slice(1, self._model.nbody))
-        self._announce(self._model, observed, highest=1.0, seed=seed)
+        self._announce(model, observed, highest=1.0, seed=seed)
 
     def _begin(self, mask: Tensor) -> None:
         physics = self._physics
         physics.reset(mask)
-        qpos, qvel = self._starts.take(self._row_seed, self._episode, mask)
-        put(physics.qpos, mask, qpos)
-        put(physics.qvel, mask, qvel)
+        keys = [rng.fold(self._row_seed, self._episode + ahead) for ahead in (0, 1)]
+        start = self._starts(*keys, mask)
+        put(physics.qpos, mask, start[:, : self._model.nq])
+        put(physics.qvel, mask, start[:, self._model.nq :])
         physics.forward(mask)
         self._start(mask)
         self._step_count.masked_fill_(mask, 0)
@@ -120,8 +122,6 @@ class VelocityEnv(SimulatedEnv):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = self._checked_action(tensordict).to(self._physics.dtype)
-        if not self._all_begun:
-            require_episodes(self._begun)
         reward, terminated = self._move(action.clamp(*self._control_range))
         self._observer.write(self._physics, self._observation)
         self._step_count += 1
@@ -163,7 +163,7 @@ class VelocityEnv(SimulatedEnv):
         return RobotRenderer(self.config, self._physics)
 
     def _read_state(self) -> TensorDict:
-        state = {key: getattr(self._physics, key).clone() for key in _PHYSICS_KEYS}
+        state = {key: getattr(self._physics, key).clone() for key in RESTORED}
         state |= {"step_count": self._step_count.clone(), "place": self._last_place.clone()}
         state["observation"] = self._observation.clone()
         return TensorDict(state, batch_size=self.batch_size)
@@ -172,7 +172,7 @@ class VelocityEnv(SimulatedEnv):
         check_state(self.get_state(), state, _OPTIONAL_KEYS)
         everyone = torch.ones_like(self._begun)
         self._physics.reset(everyone)
-        for key in _PHYSICS_KEYS:
+        for key in RESTORED:
             getattr(self._physics, key).copy_(state[key])
         self._step_count.copy_(state["step_count"])
         self._physics.forward()
@@ -181,31 +181,8 @@ class VelocityEnv(SimulatedEnv):
         self._observation.copy_(state.get("observation", self._observation))
 
 
-class Starts:
-    """Initial states of episodes, drawn for all rows at once, which takes no longer than for one.
-
-    An initial state depends only on the row's seed and the episode, see `rng`.
-    """
-
-    def __init__(self, config: VelocityConfig, model: mujoco.MjModel) -> None:
-        self._config, self._model = config, model
-        self._keys: Tensor | None = None
-        self._drawn: tuple[Tensor, Tensor]
-
-    def take(self, seeds: Tensor, episodes: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Return initial positions [N, nq] and velocities [N, nv], valid in the rows of a mask.
-
-        `seeds` and `episodes` are those of all rows, int64 [N].
-        """
-        # the next episodes of the rows that go on are drawn too
-        keys = rng.fold(seeds, episodes + ~mask)
-        if self._keys is None or ((self._keys != keys) & mask).any():
-            self._keys, self._drawn = keys, draw_start(self._config, self._model, keys)
-        return self._drawn
-
-
-def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Draw initial positions [R, nq] and velocities [R, nv] from keys [R], as Gymnasium does.
+def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> Tensor:
+    """Draw initial positions and velocities [R, nq + nv] from keys [R], as Gymnasium does.
 
     Positions are uniform within the noise scale around the model's. Velocities have the mean 0 and
     are uniform within the noise scale, or normal with it as standard deviation. All are float64.
@@ -218,7 +195,7 @@ def draw_start(config: VelocityConfig, model: mujoco.MjModel, key: Tensor) -> tu
         draws = _symmetric(key[:, None], columns)
         positions, velocities = draws.split([model.nq, model.nv], -1)
     initial, scale = torch.from_numpy(model.qpos0.copy()).to(key.device), config.reset_noise_scale
-    return initial + scale * positions, scale * velocities
+    return torch.cat([initial + scale * positions, scale * velocities], -1)
 
 
 def _symmetric(keys: Tensor, columns: Tensor) -> Tensor:
