@@ -128,7 +128,8 @@ _FORM = (
     "'{cost_speed: [2, -4, 4]}' (column of the observation, lowest, highest), or for another entry "
     "[thdot, -4, 4], or with its column [thdot, 0, -4, 4]"
 )
-_Column, _Bound = Annotated[int, Interval(ge=0)], int | Annotated[float, AllowInfNan()]
+_Column = Annotated[int, Interval(ge=0)]
+_Bound = int | Annotated[float, AllowInfNan()]
 _Row = (
     tuple[_Column, _Bound, _Bound]
     | tuple[str, _Bound, _Bound]

@@ -103,8 +103,8 @@ class VelocityEnv(SimulatedEnv):
     def _begin(self, mask: Tensor) -> None:
         physics = self._physics
         physics.reset(mask)
-        keys = [rng.fold(self._row_seed, self._episode + ahead) for ahead in (0, 1)]
-        start = self._starts(*keys, mask)
+        key = rng.fold(self._row_seed, self._episode)
+        start = self._starts(key, rng.fold(self._row_seed, self._episode + 1), mask)
         put(physics.qpos, mask, start[:, : self._model.nq])
         put(physics.qvel, mask, start[:, self._model.nq :])
         physics.forward(mask)
