@@ -199,16 +199,26 @@ def _in_units_of_policy(
     chosen = [spec.low.cpu(), spec.high.cpu()]
     raw = [bound.flatten() for bound in env.action_bounds]
     if is_recorded:
-        recorded, known = chosen + raw, interface.get("actions")
-        if known is not None:
-            names = ("low", "high", "own_low", "own_high")
-            recorded = [torch.tensor(known[name]).float() for name in names]
+        recorded = _recorded_bounds(interface, chosen + raw)
         action = action.clamp(*recorded[:2])
         if all(map(torch.equal, recorded, chosen + raw)):
             return action
         action = _rescaled(action, recorded[:2], recorded[2:])
     _check_bounds(action, *raw)
     return _rescaled(action, raw, chosen).clamp(*chosen)
+
+
+def _recorded_bounds(interface: Mapping[str, Any], otherwise: list[Tensor]) -> list[Tensor]:
+    if interface.get("actions") is None:
+        return otherwise
+    try:
+        names = ("low", "high", "own_low", "own_high")
+        bounds = [torch.tensor(interface["actions"][name]).float() for name in names]
+        if any(bound.shape != otherwise[0].shape for bound in bounds):
+            raise ValueError("there must be one per column")
+        return bounds
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the bounds of its actions cannot be read: {error}") from error
 
 
 def _rescaled(action: Tensor, old: list[Tensor], new: list[Tensor]) -> Tensor:

@@ -105,7 +105,13 @@ class OffPolicy(Resumable, Algorithm):
         gammas = dict.fromkeys(["reward", *constraints.keys], config.loss.get("gamma", 1.0))
         if (cost_gamma := config.loss.get("cost_gamma")) is not None:
             gammas |= dict.fromkeys(constraints.keys, cost_gamma)
-        buffer = instantiate(config.memory, in_keys=loss.in_keys, gammas=gammas, device=device)
+        buffer = instantiate(
+            config.memory,
+            in_keys=loss.in_keys,
+            gammas=gammas,
+            device=device,
+            example=env.fake_tensordict(),
+        )
         learns_from, collects = fill_replay_buffer(config, buffer, env)
         random_steps = config.exploration.random_steps if collects else 0
         _check_room(buffer, random_steps // env.steps_per_decision, collects)

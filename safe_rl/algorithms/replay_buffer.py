@@ -16,6 +16,7 @@ from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.checks import Checked, Share
+from safe_rl.naming import key_name
 from safe_rl.resumable import Resumable
 
 _MOST_AT_ONCE = 16_384
@@ -44,6 +45,8 @@ class Memory(Checked):
             sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
+        example: A step [N] with the entries of all steps, such as ``env.fake_tensordict()``:
+            transitions of other shapes and types are not restored. None: all are.
 
     Raises:
         ValueError: If ``prioritised`` has other keys than these two.
@@ -75,8 +78,10 @@ class Memory(Checked):
         prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,
+        example: TensorDictBase | None = None,
     ) -> None:
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
+        self._example = None if example is None else example.to("meta")
         self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         self.is_prioritised = prioritised is not None
         self._buffer = TensorDictReplayBuffer(
@@ -182,8 +187,7 @@ class Memory(Checked):
         """Continue from `state_dict`.
 
         Raises:
-            ValueError: If there are more transitions than the buffer has room for.
-            KeyError: If entries are missing.
+            ValueError: If entries are missing, or have other shapes or types than the example's.
         """
         size, writer = state_dict["size"], state_dict["writer"]
         if size > self.capacity or writer["_cursor"] not in range(self.capacity):
@@ -202,7 +206,19 @@ class Memory(Checked):
     def _restored(
         self, entries: Mapping[str, Tensor], shape: list[int], further: Sequence[NestedKey]
     ) -> TensorDictBase:
-        """Saved steps of a shape, with these further entries."""
+        """Saved steps of a shape, of these and further entries, compared with the example."""
+        if self._example is not None:
+            expected = self._example.select(*self.in_keys, strict=False).flatten_keys("/")
+            rows = [*self._example.shape, *shape[1:]] if len(shape) > 1 else shape
+            if missing := {*expected.keys(), *map(key_name, further)} - set(entries):
+                raise ValueError(f"there is no '{min(missing)}'.")
+            for key, value in expected.items():
+                found, wanted = torch.as_tensor(entries[key]), [*rows, *value.shape[1:]]
+                if list(found.shape) != wanted or found.dtype != value.dtype:
+                    raise ValueError(
+                        f"'{key}' is {found.dtype} of the shape {list(found.shape)}, expected "
+                        f"{value.dtype} of the shape {wanted}."
+                    )
         # the saved run may have used another device
         steps = TensorDict(entries, shape, device=self._device).unflatten_keys("/")
         return steps.select(*dict.fromkeys([*self.in_keys, *further]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -183,6 +184,20 @@ class EpisodeAccounting(Resumable):
         # changes sums of rewards far less than the digits that are logged
         self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
         self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore the sums.
+
+        Raises:
+            ValueError: If numbers of steps or costs are below 0, or sums are not finite. Only the
+                number of steps of an episode that is left out is NaN.
+        """
+        super().load_state_dict(state_dict)
+        sums = torch.cat([self.open_sums, self.totals[None]])
+        sums[:-1, 0].masked_fill_(sums[:-1, 0].isnan(), 0.0)
+        # the second column has rewards
+        if not sums.isfinite().all() or (sums[:, [0, *range(2, sums.shape[1])]] < 0).any():
+            raise ValueError("sums of steps and costs must be finite and not below 0.")
 
     def update(self, batch: TensorDictBase) -> EpisodeStatistics:
         """Add the next batch of consecutive steps, [N, T], or [T] of a single environment.

@@ -57,9 +57,25 @@ def load_edited(trained, *edit):
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda s: s["steps"].pop("steps_to_next_obs"), "steps_to_next_obs"),
+        (
+            lambda s: s["steps"].update(observation=torch.ones(308, 3)),
+            r"'observation' is .* \[308, 3\], .* \[308, 4\]",
+        ),
+        (
+            lambda s: s["steps"].update({"next/reward": torch.ones(308, 1).long()}),
+            "'next/reward' is torch.int64",
+        ),
+        (lambda s: s["steps"].update(action=torch.ones(9, 2)), r"'action' is .* \[9, 2\]"),
+        (lambda s: s["steps"].update(action=[1.0]), r"'action' is .* \[1\]"),
+        (lambda s: s["steps"].pop("next/cost"), "there is no 'next/cost'"),
+        (lambda s: s["steps"].pop("steps_to_next_obs"), "there is no 'steps_to_next_obs"),
         (lambda s: s.update(size=10**9), "are too many"),
         (lambda s: s["writer"].update(_cursor=-1), "308 transitions, the next at -1"),
+        (lambda s: s["tail"].update(action=torch.ones(4, 3, 1)), r"'action' is .* \[4, 3, 1\]"),
+        (
+            lambda s: s.update(tail={k: v[:2] for k, v in s["tail"].items()}, tail_shape=[2, 3]),
+            r"\[2, 3, .\], .* \[4, 3, .\]",
+        ),
     ],
 )
 def test_transitions_of_another_kind_are_refused_in_a_line(edit, words, off_policy, tmp_path):
@@ -80,6 +96,9 @@ def moments(state):
         ("progress", lambda state: state.update(steps=-1), "not below 0"),
         ("progress", lambda state: state.update(seconds=math.nan), "must be finite"),
         ("progress", dict.clear, "there is no 'epoch'"),
+        ("accounting", lambda state: state["totals"].fill_(math.nan), "must be finite"),
+        ("accounting", lambda state: state["totals"].neg_(), "not below 0"),
+        ("accounting", lambda state: state["open_sums"][:, 0].fill_(-3), "not below 0"),
         ("accounting", lambda state: state.update(totals=[1.0]), "'totals' is a list"),
         ("accounting", lambda state: state.update(open_sums=torch.ones(9, 3)), "of the shape"),
         ("policy_update", lambda state: state.update(optimizer=[]), ""),
