@@ -95,6 +95,7 @@ def ours(args: argparse.Namespace) -> Callable[[], None]:
         optimizer=functools.partial(torch.optim.Adam, lr=1e-3, fused=True),
         updates_per_step=0.05,
         tau=0.01,
+        policy_delay=args.policy_delay,
     )
     return lambda: update(memory, args.updates)
 
@@ -121,6 +122,7 @@ def seconds(call: Callable[[], None]) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hidden", type=int, nargs="+", default=[128, 128])
+    parser.add_argument("--policy-delay", type=int, default=1)
     parser.add_argument("--batch-size", type=int, default=256)
     parser.add_argument("--observation-size", type=int, default=60)
     parser.add_argument("--updates", type=int, default=50)
