@@ -146,16 +146,14 @@ class OffPolicy(Resumable, Algorithm):
     def lost_on_resume(self) -> str:
         """A sentence on the state that a checkpoint does not have; empty if it has all of it."""
         buffer = self.replay_buffer
-        if buffer.keeps or not (self.collects or buffer.is_prioritised):
+        if buffer.keeps or not self.collects:
             return ""
-        lost, then = "transitions", f"resumes when it holds {self.random_steps:,} new ones, and "
-        if not self.collects:
-            lost, then = "priorities", ""
-        elif len(buffer):
-            then = "resumes with those of the dataset alone, and "
+        when = "with those of the dataset alone"
+        if not len(buffer):
+            when = f"when it holds {self.random_steps:,} new ones"
         return (
-            f"The {lost} in its replay buffer are not stored (memory.keep=false): learning "
-            f"{then}differs from a run that was not interrupted."
+            "The transitions in its replay buffer are not stored (memory.keep=false): learning "
+            f"resumes {when}, and differs from a run that was not interrupted."
         )
 
     def learn(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> dict[str, float]:
@@ -226,12 +224,7 @@ def _check_room(buffer: Memory, random_steps: int, collects: bool) -> None:
 
 
 def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
-    """Refuse priorities without TD errors, and a risk measure that the critics do not support."""
-    if config.memory.get("prioritised") and loss.priority_key is None:
-        raise ValueError(
-            f"memory.prioritised: algo={config.algo.name} has no TD errors by which transitions "
-            "are drawn. Use memory.prioritised=null."
-        )
+    """Refuse a risk measure that the critics do not support."""
     risk, known = constraints.risk, loss.risk_measure
     if risk is None or (known is not None and isinstance(risk, known)):
         return

@@ -1,4 +1,4 @@
-"""The replay buffer, with uniform or prioritised sampling."""
+"""The replay buffer."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ from annotated_types import Interval
 from pydantic import PositiveInt
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import LazyTensorStorage, RandomSampler, TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, Sampler
-from torchrl.data.replay_buffers.storages import Storage
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 
-from safe_rl.checks import Checked, Share
+from safe_rl.checks import Checked
 from safe_rl.naming import key_name
-from safe_rl.resumable import Resumable
 
 _MOST_AT_ONCE = 16_384
 """Largest number of transitions that are sampled in one call and then cut into minibatches."""
@@ -41,19 +38,13 @@ class Memory(Checked):
         in_keys: Entries of a step that are stored.
         gammas: Entry below ``next`` that is summed over n steps -> discount per step.
         n_steps: Number n of steps that a transition spans (n-step returns).
-        prioritised: Exponents ``alpha`` and ``beta`` of prioritised replay, or None for uniform
-            sampling. See Schaul et al. 2016, sections 3.3 and 3.4.
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
         example: A step [N] with the entries of all steps, such as ``env.fake_tensordict()``:
             transitions of other shapes and types are not restored. None: all are.
 
-    Raises:
-        ValueError: If ``prioritised`` has other keys than these two.
-
     Attributes:
         keeps: ``keep``.
-        is_prioritised: Whether transitions have priorities.
 
     Examples:
         >>> memory = Memory(
@@ -75,7 +66,6 @@ class Memory(Checked):
         in_keys: Sequence[NestedKey],
         gammas: Mapping[NestedKey, float],
         n_steps: Annotated[int, Interval(ge=1, le=1000)],
-        prioritised: Mapping[str, Share] | None = None,
         keep: bool,
         device: torch.device | str | None = None,
         example: TensorDictBase | None = None,
@@ -83,11 +73,8 @@ class Memory(Checked):
         self.batch_size, self.keeps, self.capacity = batch_size, keep, capacity
         self._example = None if example is None else example.to("meta")
         self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
-        self.is_prioritised = prioritised is not None
-        self._buffer = TensorDictReplayBuffer(
-            storage=LazyTensorStorage(capacity, device=self._device),
-            sampler=_sampler(capacity, prioritised),
-        )
+        storage = LazyTensorStorage(capacity, device=self._device)
+        self._buffer = TensorDictReplayBuffer(storage=storage)
         keys_of: dict[float, list[NestedKey]] = {}
         for key, gamma in gammas.items() if n_steps > 1 else ():
             keys_of.setdefault(gamma, []).append(key)
@@ -151,27 +138,17 @@ class Memory(Checked):
             transform._buffer = kept
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
-        """Draw a number of minibatches.
-
-        Uniform samples of several minibatches are gathered together, in a tenth of the time.
-        """
-        at_once = 1 if self.is_prioritised else max(1, _MOST_AT_ONCE // self.batch_size)
+        """Draw a number of minibatches, several at once, which takes a tenth of the time."""
+        at_once = max(1, _MOST_AT_ONCE // self.batch_size)
         for first in range(0, number, at_once):
             count = min(at_once, number - first)
             drawn = self._buffer.sample(count * self.batch_size).to(self._device)
             yield from drawn.split(self.batch_size)
 
-    def set_priorities(self, minibatch: TensorDictBase, errors: Tensor) -> None:
-        """Set the priorities of the transitions of a minibatch [B] by their TD errors [B]."""
-        if self.is_prioritised:
-            self._buffer.update_priority(minibatch["index"], errors)
-
     def state_dict(self) -> dict[str, Any]:
         """The transitions, the position of the next one, and the state of n-step sums."""
         size = len(self)
         state: dict[str, Any] = {"size": size, "writer": self._buffer.writer.state_dict()}
-        if self.is_prioritised:
-            state["sampler"] = self._buffer.sampler.state_dict()
         if size:
             steps = self._buffer[:].exclude("index").flatten_keys("/")
             # of a view, torch would save the whole underlying storage
@@ -196,8 +173,6 @@ class Memory(Checked):
         if size:
             self._buffer.extend(self._restored(state_dict["steps"], [size], self._spanned))
         self._buffer.writer.load_state_dict(writer)
-        if self.is_prioritised:
-            self._buffer.sampler.load_state_dict(state_dict["sampler"])
         self._set_waiting(None)
         if self._n_step_transforms and "tail" in state_dict:
             tail, shape = state_dict["tail"], state_dict["tail_shape"]
@@ -227,76 +202,3 @@ class Memory(Checked):
 def _read_by(transform: MultiStepTransform) -> list[NestedKey]:
     """Entries of steps from which sums are computed."""
     return [("next", key) for key in ("done", *transform.reward_keys)]
-
-
-def _sampler(capacity: int, prioritised: Mapping[str, float] | None) -> Sampler:
-    if prioritised is None:
-        return RandomSampler()
-    if set(prioritised) != {"alpha", "beta"}:
-        raise ValueError(
-            f"memory.prioritised={dict(prioritised)}: it must hold alpha and beta, as in "
-            "{alpha: 0.6, beta: 0.4}, or be null."
-        )
-    return ProportionalSampler(capacity, **prioritised)
-
-
-_SMALLEST = 1e-8
-"""ε, added to TD errors, so that every transition can be drawn."""
-
-
-class ProportionalSampler(Resumable, PrioritizedSampler):
-    """Samples transition i with probability p_i / Σ p, where p = (|TD error| + ε)^α.
-
-    Schaul et al. 2016, section 3.3. Samples have the importance weights (p_i / min p)^−β (section
-    3.4, with the largest weight 1). New transitions get the largest p so far.
-
-    TorchRL's `PrioritizedSampler` has three problems: it needs a compiled extension that is missing
-    if torch is newer than the version it was built for; it samples from NumPy's generator, which a
-    run does not seed; and it gives new transitions no priority. This class sums all priorities for
-    every sample, a millisecond for a million transitions. It is a subclass, because only those get
-    priorities from a buffer's ``update_tensordict_priority``. The storage has one dimension.
-    """
-
-    state_names = ("_priorities", "_largest")
-    alpha = beta = 0.0  # not the properties of the base class
-    reduction, __repr__ = "max", Sampler.__repr__
-
-    def __init__(self, capacity: int, *, alpha: float, beta: float) -> None:
-        # the constructor of the base class needs the extension
-        self.alpha, self.beta = alpha, beta
-        self._priorities = torch.zeros(capacity, dtype=torch.float64)
-        self._largest = 1.0
-
-    @property
-    def default_priority(self) -> float:
-        """TD error of the largest priority so far."""
-        return self._largest ** (1 / self.alpha) - _SMALLEST if self.alpha else 1.0
-
-    def add(self, index: int | Tensor) -> None:
-        """Give new transitions the largest priority so far."""
-        self._priorities[torch.as_tensor(index).cpu()] = self._largest
-
-    extend = add
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Tensor]]:
-        """Draw indices [B] with replacement, with importance weights [B] as ``priority_weight``."""
-        present = self._priorities[: len(storage)]
-        sums = present.cumsum(0)
-        drawn = torch.rand(batch_size, dtype=sums.dtype, generator=self._rng) * sums[-1]
-        index = torch.searchsorted(sums, drawn, right=True).clamp_max(len(present) - 1)
-        weight = (present[index] / present.min()) ** -self.beta
-        return index, {"priority_weight": weight.float()}
-
-    @torch.no_grad()
-    def update_priority(
-        self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None
-    ) -> None:
-        """Set the priorities of transitions from their TD errors."""
-        errors = torch.as_tensor(priority).to(self._priorities).abs()
-        raised = (errors + _SMALLEST) ** self.alpha
-        self._priorities[torch.as_tensor(index).cpu()] = raised
-        self._largest = max(self._largest, raised.max().item())
-
-    def _empty(self) -> None:
-        self._priorities.zero_()
-        self._largest = 1.0

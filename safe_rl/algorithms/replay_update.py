@@ -123,7 +123,7 @@ class ReplayUpdate(Checked):
                 # it removes TensorDicts from torch's pytrees, for the whole process
                 warnings.filterwarnings("ignore", message="Tensordict is registered in PyTree")
                 steps = {key: CudaGraphModule(f, device=self._device) for key, f in steps.items()}
-        self._steps: Mapping[bool, Callable[[TensorDictBase], tuple[Tensor, Tensor | None]]] = steps
+        self._steps: Mapping[bool, Callable[[TensorDictBase], Tensor]] = steps
 
     @torch.no_grad()
     def equate_targets(self) -> None:
@@ -149,15 +149,12 @@ class ReplayUpdate(Checked):
         for minibatch in buffer.minibatches(number):
             with_actor = self._counts["updates"] % self.policy_delay == 0
             try:
-                values, priority = self._steps[with_actor](minibatch)
+                sums += self._steps[with_actor](minibatch)
             except RuntimeError as error:
                 if self._uses_graphs:
                     error.add_note(_NO_GRAPH)
                 raise
             self._counts["updates"] += 1
-            if priority is not None:
-                buffer.set_priorities(minibatch, priority)
-            sums += values
             reported = self._reported[with_actor]
             counts = {name: count + (name in reported) for name, count in counts.items()}
         sums = sums.cpu()
@@ -167,8 +164,8 @@ class ReplayUpdate(Checked):
         means = sums / torch.tensor([float(count) for count in counts.values()])
         return dict(zip(names, means, strict=True)) | {"num_updates": torch.tensor(float(number))}
 
-    def _step(self, with_actor: bool, minibatch: TensorDictBase) -> tuple[Tensor, Tensor | None]:
-        """Take a step. Returns the means of all that the loss can report, and TD errors if any."""
+    def _step(self, with_actor: bool, minibatch: TensorDictBase) -> Tensor:
+        """Take a step. Returns the means of all that the loss can report, 0 of what it does not."""
         minibatch = minibatch.copy()  # losses may replace entries, but a graph reads the given ones
         losses = self.loss(minibatch) if with_actor else self.loss.critic_losses(minibatch)
         total = sum_of_losses(losses)
@@ -187,9 +184,7 @@ class ReplayUpdate(Checked):
         values, nothing = dict(losses.items()), torch.zeros((), device=self._device)
         self._reported[with_actor] = list(values)
         with torch.no_grad():
-            means = [values.get(name, nothing).mean() for name in self.loss.out_keys]
-        priority = self.loss.priority_key
-        return torch.stack(means), None if priority is None else minibatch.get(priority, None)
+            return torch.stack([values.get(k, nothing).mean() for k in self.loss.out_keys])
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
         """Parameters and buffers of the loss, by name."""

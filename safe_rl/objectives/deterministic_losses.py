@@ -157,7 +157,6 @@ class BCLoss(ReplayLoss):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
     reduction = "mean"
-    priority_key = None
 
     def __init__(self, actor_network: TensorDictModuleBase) -> None:
         super().__init__()

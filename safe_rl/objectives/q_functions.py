@@ -54,11 +54,6 @@ class ReplayLoss(Checked, SharesTensors):
 
     risk_measure: type | None = None
 
-    @property
-    def priority_key(self) -> NestedKey | None:
-        """Key of the TD errors, [...], for prioritised replay; None if the loss writes none."""
-        return "td_error"
-
     def target_pairs(self) -> list[tuple[Tensor, Tensor]]:
         """Pairs of tensors: of a target network, and of the network that it follows.
 
@@ -117,11 +112,6 @@ class QFunctionLoss(ReplayLoss):
             TensorDict with `out_keys`, without batch dimension.
         """
         return self.critic_losses(tensordict).update(self.actor_losses(tensordict))
-
-    @property
-    def priority_key(self) -> NestedKey:
-        """Key of the TD errors, [...]."""
-        return self.tensor_keys.priority
 
     def _make_vmap(self) -> None:
         """Make no functions by vmap: an ensemble evaluates all of its networks in one call."""

@@ -1,16 +1,10 @@
 """What a memory gives back: the transitions that went in, over one step or over several."""
 
-from functools import partial
-
-import numpy as np
 import pytest
 import torch
-from scipy import stats
 from tensordict import TensorDict
 
-from safe_rl.algorithms import Memory, ReplayUpdate
-from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import SACLoss
+from safe_rl.algorithms import Memory
 
 IN_KEYS = [
     *("observation", "action"),
@@ -163,79 +157,6 @@ def test_a_copy_on_another_device_goes_on_there():
     copy.load_state_dict(memory.state_dict())
     copy.extend(make_batch(2, 1).to("meta"))
     assert copy.state_dict()["tail"]["observation"].is_meta
-
-
-EXPONENTS = {"alpha": 0.7, "beta": 0.4}
-
-
-def prioritised_by(errors, **exponents):
-    """A memory of ten transitions whose errors have been learned."""
-    memory = make_memory(keep=False, prioritised={**EXPONENTS, **exponents})
-    memory.extend(make_batch(0, 10, rows=1))
-    for minibatch in memory.minibatches(5):
-        number = minibatch["observation"].squeeze(-1).long()
-        memory.set_priorities(minibatch, torch.tensor(errors)[number])
-    return memory
-
-
-def test_draws_and_weights_are_those_of_the_article():
-    """Schaul et al. 2016: P(i) = p_i^α / Σ p^α, w_i = (N P(i))^−β over the largest."""
-    errors = np.linspace(0.2, 4.0, 10)
-    drawn = torch.cat(list(prioritised_by(errors).minibatches(600)))
-    number = drawn["observation"].squeeze(-1).long().numpy()
-    chances = errors**0.7 / (errors**0.7).sum()
-    counts = np.bincount(number, minlength=10)
-    assert stats.chisquare(counts, chances * counts.sum()).pvalue > 1e-3
-    weights = (10 * chances) ** -0.4
-    expected = torch.tensor(weights / weights.max()).float()[number]
-    torch.testing.assert_close(drawn["priority_weight"], expected)
-
-
-def test_new_transitions_are_drawn_like_the_worst_ones():
-    memory = prioritised_by([1.0] * 9 + [50.0], alpha=1.0)
-    memory.extend(make_batch(10, 1, rows=1))
-    drawn = torch.cat([m["observation"] for m in memory.minibatches(100)])
-    shares = [(drawn == number).float().mean().item() for number in (9, 10)]
-    assert shares == pytest.approx([50 / 109] * 2, abs=0.03)
-
-
-def test_the_oldest_go_with_their_priorities():
-    memory = make_memory(capacity=4, keep=False, prioritised={"alpha": 1.0, "beta": 1.0})
-    memory.extend(make_batch(0, 4, rows=1))
-    for minibatch in memory.minibatches(2):
-        memory.set_priorities(minibatch, torch.zeros(len(minibatch)))
-    memory.extend(make_batch(4, 2, rows=1))
-    drawn = torch.cat([m["observation"] for m in memory.minibatches(20)])
-    assert set(drawn.flatten().tolist()) == {4, 5}
-
-
-def test_a_copy_goes_on_with_the_same_priorities(tmp_path):
-    memory = prioritised_by(np.linspace(0.2, 4.0, 10))
-    copy = make_memory(keep=False, prioritised=EXPONENTS)
-    torch.save(memory.state_dict(), tmp_path / "state")
-    copy.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
-    check_draws(memory, copy, make_batch(10, 5, rows=1))
-
-
-def test_errors_are_read_where_the_loss_writes_them():
-    actor = make_squashed_actor(1, -torch.ones(1), torch.ones(1), hidden_sizes=[8])
-    q = QEnsemble(1, 1, hidden_sizes=[8], num_networks=2)
-    loss = SACLoss(actor, q, gamma=0.9, alpha_init=0.1, target_entropy=-1.0)
-    loss.set_keys(priority="error")
-    memory = make_memory(batch_size=8, keep=False, prioritised=EXPONENTS)
-    memory.extend(make_batch(0, 10, rows=1))
-    update = ReplayUpdate(
-        loss, optimizer=partial(torch.optim.SGD, lr=0.0), updates_per_step=1.0, tau=0.1
-    )
-    update(memory, 1)
-    # the rewards of these steps differ, and so do the errors
-    assert next(memory.minibatches(1))["priority_weight"].unique().numel() > 1
-
-
-@pytest.mark.parametrize("exponents", [{"alpha": 0.6}, {"alpha": 0.6, "beta": 0.4, "eps": 1.0}])
-def test_exponents_that_are_missing_or_too_many_are_named(exponents):
-    with pytest.raises(ValueError, match="it must hold alpha and beta, as in"):
-        make_memory(prioritised=exponents)
 
 
 def test_sums_over_long_rows_are_those_of_all_their_episodes():

@@ -283,7 +283,6 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     ("algo", "key", "value"),
     [
         ("ppo", "transforms.saute.budgets", {"cost_hazards": 10}),
-        ("sac", "memory.prioritised", {"alpha": 0.6, "beta": 0.4}),
         ("sac", "policy_update.rates", {"alpha": 0.001}),
     ],
 )

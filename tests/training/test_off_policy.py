@@ -55,7 +55,6 @@ def test_it_writes_a_run(algo, make_trainer, tmp_path):
         ["algo=sac_lagrangian", "cost_limits={cost_hazards: 1, cost_north: 2}", "lagrangian=pid"],
         ["algo=wcsac", "risk.window=9"],
         ["algo=cal", "lagrangian=pid"],
-        ["algo=td3_lagrangian", "memory.prioritised={alpha: 0.6, beta: 0.4}"],
     ],
 )
 def test_it_resumes_with_its_replay_buffer_as_if_it_had_never_stopped(

@@ -191,9 +191,6 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     assert alone.epoch(iter(alone.collector))["policy_num_updates"] == 8
     assert not alone.algorithm.policy.is_random
     assert len(alone.algorithm.replay_buffer) == before
-    keys += ["memory.prioritised={alpha: 0.6, beta: 0.4}"]
-    drawn = make_trainer(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "drawn")
-    assert "priorities" in drawn.algorithm.lost_on_resume
 
 
 def test_the_loss_is_the_mean_squared_difference():
@@ -217,8 +214,6 @@ def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path)
     with pytest.raises(ValueError, match="the replay buffer holds 160 transitions") as error:
         OffPolicy.from_config(offline_config(data, "memory.batch_size=512"), PointMass(4))
     assert "a minibatch of 512 (memory.batch_size)" in str(error.value)
-    with pytest.raises(ValueError, match="algo=bc has no TD errors"):
-        OffPolicy.from_config(offline_config(data, "memory.prioritised={alpha: 1}"), PointMass(4))
 
 
 @pytest.mark.parametrize(
