@@ -5,7 +5,7 @@ import functools
 import torch
 from samples import NUM_OBS
 from tensordict import TensorDict
-from tensordict.nn import CompositeDistribution, NormalParamExtractor, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
 from torch.distributions import (
     AffineTransform,
@@ -73,26 +73,6 @@ class Positive(nn.Module):
         return tuple((1 + nn.functional.softplus(x)).chunk(2, -1))
 
 
-class Steering(nn.Module):
-    """Outputs of a network as parameters of three parts: a number, two numbers, a choice."""
-
-    def forward(self, x):
-        loc, scale = NormalParamExtractor()(x[..., :2])
-        pair, other = NormalParamExtractor()(x[..., 2:6])
-        parts = {
-            "throttle": {"loc": loc.squeeze(-1), "scale": scale.squeeze(-1)},
-            "wheel": {"loc": pair, "scale": other},
-            "gear": {"logits": x[..., 6:]},
-        }
-        return TensorDict(parts, batch_size=x.shape[:-1])
-
-
-def composite(wheel):
-    parts = {"throttle": Normal, "wheel": wheel, "gear": Categorical}
-    names = {"throttle": ("hand", "throttle"), "wheel": ("hand", "wheel"), "gear": "gear"}
-    return functools.partial(CompositeDistribution, distribution_map=parts, name_map=names)
-
-
 class Number(nn.Module):
     """Mean and standard deviation of an action that is no vector."""
 
@@ -113,15 +93,10 @@ KINDS = {
     "categorical": (5, nn.Identity(), ["logits"], Categorical),
     "one_hot": (5, nn.Identity(), ["logits"], OneHotCategorical),
     "unequal_multi_discrete": (5, _Components([2, 3]), ["logits"], choices),
-    "composite": (9, Steering(), ["params"], composite(IndependentNormal)),
-    "apart_composite": (9, Steering(), ["params"], composite(Normal)),
-    "sampled_composite": (9, Steering(), ["params"], composite(Anonymous)),
     "anonymous": (4, NormalParamExtractor(), ["loc", "scale"], Anonymous),
     "unreparametrised": (4, NormalParamExtractor(), ["loc", "scale"], Unreparametrised),
 }  # fmt: skip
 SAMPLED_KL = {"learned_transform", "truncated_normal", "anonymous", "unreparametrised"}
-COMPOSITE = {kind for kind in KINDS if "composite" in kind}
-ACTIONS = [("hand", "throttle"), ("hand", "wheel"), "gear"]
 
 
 def make_actor(kind):
@@ -131,7 +106,6 @@ def make_actor(kind):
         TensorDictModule(net, in_keys=["observation"], out_keys=keys),
         in_keys=keys,
         distribution_class=distribution,
-        out_keys=ACTIONS if kind in COMPOSITE else None,
         default_interaction_type=ExplorationType.RANDOM,
         return_log_prob=True,
     )

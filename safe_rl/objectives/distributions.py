@@ -3,22 +3,13 @@
 There are closed forms for Normals and for everything registered with
 `torch.distributions.kl_divergence`; other distributions are evaluated from samples. A tanh-Normal
 counts as a Normal: its transform is the same for every policy, so it changes neither KL divergence
-nor Fisher information. The parts of a composite distribution are independent, so all quantities are
-sums over the parts.
+nor Fisher information.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import partial
-
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import (
-    CompositeDistribution,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-)
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
 from torch import Tensor
 from torch.distributions import (
     Categorical,
@@ -52,8 +43,6 @@ def root(distribution: Distribution) -> Distribution:
 
 def has_closed_kl(distribution: Distribution) -> bool:
     """Whether the divergence between two distributions of this kind needs no samples."""
-    if isinstance(distribution, CompositeDistribution):
-        return all(map(has_closed_kl, distribution.dists.values()))
     under = root(distribution)
     if isinstance(under, TransformedDistribution):
         # torch has a closed form for equal transforms only, which ignores what they have learned
@@ -61,49 +50,14 @@ def has_closed_kl(distribution: Distribution) -> bool:
     return isinstance(under, Normal) or has_analytic_kl(distribution, distribution)
 
 
-def _total(numbers: Iterable[Tensor], states: torch.Size) -> Tensor:
-    """Sum over the parts and their remaining dimensions: [*states, ...] each -> [*states]."""
-    return torch.stack([each.reshape(*states, -1).sum(-1) for each in numbers]).sum(0)
-
-
-def composite_log_probs(
-    composite: CompositeDistribution, batch: TensorDictBase, stored: Iterable[NestedKey]
-) -> tuple[Tensor, Tensor]:
-    """Joint log-probability of the parts' actions now, and the stored joint one, [...] each.
-
-    The batch has the actions under the keys of the parts, and their log-probabilities under the
-    keys `stored`.
-    """
-    states, parts = composite.batch_shape, composite.dists.items()
-    now = _total((part.log_prob(batch[key]) for key, part in parts), states)
-    return now, _total((batch[key] for key in stored), states)
-
-
-def _composite_kl(
-    p: CompositeDistribution, q: CompositeDistribution, batch: TensorDictBase
-) -> Tensor:
-    def divergence(key: NestedKey) -> Tensor:
-        part, other, log_weight = p.dists[key], q.dists[key], torch.empty(0)
-        if not has_closed_kl(part):
-            log_weight = part.log_prob(batch[key]) - other.log_prob(batch[key])
-        return kl(part, other, log_weight)
-
-    return _total(map(divergence, p.dists), p.batch_shape)
-
-
-def kl(
-    p: Distribution, q: Distribution, log_weight: Tensor, batch: TensorDictBase | None = None
-) -> Tensor:
+def kl(p: Distribution, q: Distribution, log_weight: Tensor) -> Tensor:
     """KL(p ‖ q) of two distributions of the same kind, one number per state.
 
     Without a closed form it is estimated from an action a that q sampled in each state, as ρ log ρ
     − ρ + 1 with ρ = p(a)/q(a). The estimate is unbiased and never negative. For p = q it is 0 with
     a zero gradient (Schulman, *Approximating KL divergence*, 2020). `log_weight` is log ρ of these
-    actions, [...]. For composite distributions the batch has them, under the keys of the parts.
+    actions, [...].
     """
-    if isinstance(p, CompositeDistribution):
-        assert batch is not None
-        return _composite_kl(p, q, batch)
     roots = root(p), root(q)
     if isinstance(roots[0], Normal) and isinstance(roots[1], Normal):
         divergence = kl_divergence(*roots)
@@ -123,8 +77,6 @@ def entropy(distribution: Distribution) -> Tensor:
     The gradient of a sampled entropy goes through the sample if the distribution allows it.
     Otherwise it is the score-function gradient. Both are unbiased.
     """
-    if isinstance(distribution, CompositeDistribution):
-        return _total(map(entropy, distribution.dists.values()), distribution.batch_shape)
     if has_analytic_entropy(distribution):
         return distribution.entropy()
     _, log_prob = sample_and_log_prob(distribution, reparameterize=distribution.has_rsample)
@@ -139,17 +91,6 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
     return [m for m in actor.modules() if isinstance(m, ProbabilisticTensorDictModule)][-1]
 
 
-def composite_keys(
-    sampler: ProbabilisticTensorDictModule,
-) -> tuple[list[NestedKey], list[NestedKey]] | None:
-    """Keys of the parts' actions and log-probabilities; None if it is not composite."""
-    kind = sampler.distribution_class
-    kind = kind.func if isinstance(kind, partial) else kind
-    if kind is not CompositeDistribution:
-        return None
-    return list(sampler.dist_sample_keys), list(sampler.log_prob_keys)
-
-
 class ReferencePolicy:
     """The current policy in the states of a batch, to measure the KL of later policies from it.
 
@@ -159,18 +100,12 @@ class ReferencePolicy:
     def __init__(self, distribution: Distribution) -> None:
         self.distribution = distribution
         self._sample: tuple[Tensor, Tensor] | None = None
-        self._parts: dict[NestedKey, ReferencePolicy] = {}
-        if isinstance(distribution, CompositeDistribution):
-            self._parts = {key: ReferencePolicy(part) for key, part in distribution.dists.items()}
-        elif not has_closed_kl(distribution):
+        if not has_closed_kl(distribution):
             with torch.no_grad():
                 self._sample = sample_and_log_prob(distribution)
 
     def kl(self, policy: Distribution) -> Tensor:
         """KL(policy ‖ reference) per state, [...]; an estimate uses the same samples every time."""
-        if isinstance(policy, CompositeDistribution):
-            parts = self._parts.items()
-            return _total((part.kl(policy.dists[k]) for k, part in parts), policy.batch_shape)
         log_weight = torch.empty(0)
         if self._sample is not None:
             action, log_prob = self._sample

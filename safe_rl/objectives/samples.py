@@ -31,12 +31,7 @@ def require(tensordict: TensorDictBase, key: NestedKey, hint: str = "") -> Tenso
 
 
 def inputs_of(network: TensorDictModuleBase, batch: TensorDictBase) -> TensorDictBase:
-    """A copy of the inputs of a network, into which the network may write.
-
-    A policy may write the parameters of a composite distribution one by one, below ``"params"``.
-    Then ``"params"`` is also one of its inputs. Without a copy, it would overwrite the behaviour
-    policy's parameters in the batch.
-    """
+    """A copy of the inputs of a network, into which the network may write, also below an input."""
     return batch.select(*network.in_keys).copy()
 
 
@@ -82,7 +77,6 @@ def learning_samples(
             "A recurrent policy learns from whole sequences [N, T] as collectors make them, "
             "without padding: leave split_trajs at False."
         )
-    # of nested TensorDicts all tensors
     read = batch.select(*getattr(loss, "in_keys", ()), strict=False)
     for key, entry in read.items(True, True):
         # A finite sum has only finite terms, and is much faster than a check of each term.

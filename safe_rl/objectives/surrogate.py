@@ -14,8 +14,6 @@ from torch.distributions import Distribution
 
 from safe_rl.checks import Checked
 from safe_rl.objectives.distributions import (
-    composite_keys,
-    composite_log_probs,
     entropy,
     kl,
     sampler_of,
@@ -66,8 +64,7 @@ class SurrogateLoss(Checked, SharesTensors):
     class _AcceptedKeys:
         """Keys that `set_keys` accepts.
 
-        Other parameters of the behaviour policy, and actions and log-probabilities of a composite
-        distribution, are read where the actor writes them.
+        Other parameters of the behaviour policy are read where the actor writes them.
         """
 
         advantage: NestedKey = "advantage"  # of the reward, [..., 1]
@@ -105,7 +102,6 @@ class SurrogateLoss(Checked, SharesTensors):
         sampler = sampler_of(actor_network)
         names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]
         self._parameter_keys = dict(zip(names, sampler.in_keys, strict=True))
-        self._composite_keys = composite_keys(sampler)
         self.set_keys(**{k: v for k, v in self._parameter_keys.items() if k in ("loc", "scale")})
         self.out_keys = [
             "loss_objective", "loss_entropy", *self.extra_out_keys, "kl", "entropy", "ESS",
@@ -153,8 +149,7 @@ class SurrogateLoss(Checked, SharesTensors):
         """Entries of the batch that are read."""
         keys = self.tensor_keys
         costs = [keys.cost_advantage] if self.has_costs else []
-        actions, log_probs = self._composite_keys or ([keys.action], [keys.sample_log_prob])
-        behaviour = [*actions, *log_probs, *self.behaviour_keys.values()]
+        behaviour = [keys.action, keys.sample_log_prob, *self.behaviour_keys.values()]
         return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
 
     @dispatch
@@ -203,12 +198,8 @@ class SurrogateLoss(Checked, SharesTensors):
     def _log_weight(self, tensordict: TensorDictBase, distribution: Distribution) -> Tensor:
         """log(π_θ(a|s) / π_k(a|s)), [..., 1]."""
         keys = self.tensor_keys
-        if self._composite_keys is not None:
-            stored = self._composite_keys[1]
-            now, behaviour = composite_log_probs(distribution, tensordict, stored)
-        else:
-            now = distribution.log_prob(require(tensordict, keys.action))
-            behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
+        now = distribution.log_prob(require(tensordict, keys.action))
+        behaviour = require(tensordict, keys.sample_log_prob, "The collector writes it.")
         if behaviour.shape != now.shape:
             raise ValueError(
                 f"{keys.sample_log_prob!r} has shape {tuple(behaviour.shape)}, expected "
@@ -229,7 +220,7 @@ class SurrogateLoss(Checked, SharesTensors):
         keys = self.behaviour_keys.items()
         stored = TensorDict({key: require(tensordict, place, hint) for key, place in keys})
         behaviour = self.actor_network.build_dist_from_params(stored)
-        return kl(distribution, behaviour, log_weight.squeeze(-1), tensordict)
+        return kl(distribution, behaviour, log_weight.squeeze(-1))
 
     def _advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """Reward advantage, [..., 1]."""
@@ -247,8 +238,7 @@ class SurrogateLoss(Checked, SharesTensors):
         advantage = require(tensordict, key, "CostGAE writes it.")
         num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
         # with several agents in a state, each has its own cost advantage and log-probability
-        is_composite = self._composite_keys is not None
-        samples = tensordict if is_composite else tensordict[self.tensor_keys.sample_log_prob]
+        samples = tensordict[self.tensor_keys.sample_log_prob]
         if advantage.shape != (*samples.shape, num_costs):
             raise ValueError(
                 f"{key!r} has shape {tuple(advantage.shape)}, expected "

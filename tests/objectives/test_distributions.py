@@ -5,10 +5,10 @@ import math
 
 import pytest
 import torch
-from policy_kinds import ACTIONS, COMPOSITE, KINDS, SAMPLED_KL, make_actor, make_case
+from policy_kinds import KINDS, SAMPLED_KL, make_actor, make_case
 from samples import NUM_OBS, assert_gradients_are_differences, limit_state, perturb
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, set_composite_lp_aggregate
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Categorical, Independent, kl_divergence
 from torchrl.modules import MaskedCategorical, ProbabilisticActor, TanhNormal
@@ -47,8 +47,6 @@ def test_ppo_surrogate_agrees_with_torchrl(kind):
     actor, batch = make_case(kind)
     perturb(actor, 0.1)
     theirs = ClipPPOLoss(actor, None, critic_coeff=None, clip_epsilon=0.02, entropy_coeff=0.0)
-    if kind in COMPOSITE:
-        theirs.set_keys(action=ACTIONS, sample_log_prob=actor[-1].log_prob_keys)
     expected = theirs(batch.clone())
     losses = PPOLoss(actor, clip_epsilon=0.02, entropy_coeff=0.01)(batch)
     for key in ("loss_objective", "clip_fraction", "ESS"):
@@ -62,7 +60,7 @@ def test_ppo_surrogate_agrees_with_torchrl(kind):
     torch.testing.assert_close(*gradients)
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - SAMPLED_KL - COMPOSITE))
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - SAMPLED_KL))
 def test_kl_in_closed_form(kind):
     actor, batch = make_case(kind)
     perturb(actor, 0.1)
@@ -74,93 +72,6 @@ def test_kl_in_closed_form(kind):
     torch.testing.assert_close(losses["kl"], expected.detach())
     assert losses["kl"] > 0
     assert not losses["kl"].requires_grad
-
-
-def known(part):
-    """A part as torch knows it, one number per state."""
-    part = getattr(part, "hidden", part)
-    return Independent(part, len(part.batch_shape) - 1)
-
-
-@pytest.mark.parametrize("kind", sorted(COMPOSITE))
-def test_of_a_composite_everything_is_the_sum_over_its_parts(kind):
-    actor, batch = make_case(kind, samples=100_000)
-    perturb(actor, 0.1)
-    losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
-    pairs = [
-        (known(part), known(behaviour(actor, batch).dists[key]))
-        for key, part in policy_in(actor, batch).dists.items()
-    ]
-    kls = torch.stack([kl_divergence(*pair) for pair in pairs]).sum(0)
-    entropies = torch.stack([present.entropy() for present, _ in pairs]).sum(0)
-    assert kls.shape == batch.batch_size
-    sampled = {"rtol": 0.05, "atol": 0.01} if kind == "sampled_composite" else {}
-    torch.testing.assert_close(losses["kl"], kls.mean().detach(), **sampled)
-    torch.testing.assert_close(losses["entropy"], entropies.mean().detach(), **sampled)
-    reference = ReferencePolicy(behaviour(actor, batch))
-    torch.testing.assert_close(mean_kl(reference, actor, batch), kls.mean().detach(), **sampled)
-
-
-@pytest.mark.parametrize("aggregate", [True, False])
-def test_a_composites_log_probabilities_may_be_stored_together(aggregate):
-    with set_composite_lp_aggregate(aggregate):
-        actor, batch = make_case("composite")
-        losses = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)
-    assert ("sample_log_prob" in batch) == aggregate
-    assert losses["kl"] == 0
-    torch.testing.assert_close(losses["ESS"], torch.tensor(1.0))
-    torch.testing.assert_close(losses["loss_objective"], -batch["advantage"].mean())
-
-
-class Apart(nn.Module):
-    """The parameters of a composite distribution, one by one."""
-
-    keys = (
-        *(("throttle", "loc"), ("throttle", "scale"), ("wheel", "loc"), ("wheel", "scale")),
-        ("gear", "logits"),
-    )
-
-    def __init__(self, together):
-        super().__init__()
-        self.together = together
-
-    def forward(self, observation):
-        parameters = self.together(observation)
-        return tuple(parameters[key] for key in self.keys)
-
-
-def test_parameters_of_a_composite_may_be_written_one_by_one():
-    """As in TorchRL's documentation; then their entry counts as an input of the policy."""
-    actor, batch = make_case("composite")
-    whole = actor.module[0].module
-    parameters = TensorDictModule(
-        Apart(whole), ["observation"], [("params", *key) for key in Apart.keys]
-    )
-    apart = ProbabilisticActor(
-        parameters, in_keys=["params"], out_keys=ACTIONS, return_log_prob=True,
-        distribution_class=KINDS["composite"][-1],
-    )  # fmt: skip
-    perturb(actor, 0.1)
-    written = batch.clone()
-    found, expected = (
-        FOCOPSLoss(
-            policy, LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05), entropy_coeff=0.01,
-            **PROJECTIONS[FOCOPSLoss],
-        )(batch)
-        for policy in (apart, actor)
-    )  # fmt: skip
-    assert expected["kl"] > 0
-    torch.testing.assert_close(found, expected)
-    reference = ReferencePolicy(behaviour(actor, batch))
-    torch.testing.assert_close(mean_kl(reference, apart, batch), expected["kl"])
-    torch.testing.assert_close(batch, written)
-
-
-def test_a_nan_within_a_part_is_found_before_anything_is_learnt():
-    actor, batch = make_case("composite")
-    batch["params", "wheel", "loc"][3, 0] = torch.nan
-    with pytest.raises(FloatingPointError, match=r"wheel.*1 of 64"):
-        TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)(batch)
 
 
 @pytest.mark.parametrize("kind", sorted(SAMPLED_KL))
@@ -182,7 +93,7 @@ def test_sampled_kl_is_the_divergence_on_average(kind):
     assert found.item() == pytest.approx(expected.item(), rel=0.1, abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - COMPOSITE))
+@pytest.mark.parametrize("kind", KINDS)
 def test_entropy_bonus_is_the_entropy_and_its_slope(kind):
     """Against the mean of −log p over other samples; slopes by differences of that with p fixed."""
     actor = make_actor(kind)
