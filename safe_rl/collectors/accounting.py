@@ -184,6 +184,7 @@ class EpisodeAccounting(Resumable):
         # changes sums of rewards far less than the digits that are logged
         self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
         self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
+        self._open_ids: Tensor | None = None
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore the sums.
@@ -193,6 +194,7 @@ class EpisodeAccounting(Resumable):
                 number of steps of an episode that is left out is NaN.
         """
         super().load_state_dict(state_dict)
+        self._open_ids = None
         sums = torch.cat([self.open_sums, self.totals[None]])
         sums[:-1, 0].masked_fill_(sums[:-1, 0].isnan(), 0.0)
         # the second column has rewards
@@ -206,7 +208,8 @@ class EpisodeAccounting(Resumable):
             KeyError: If a key is not in the batch.
             EpisodeError: If a cost is below 0, or an episode too long.
             FloatingPointError: If an observation, action, reward or cost is NaN or infinite.
-            ValueError: If the batch has another shape, or an entry is not one number per step.
+            ValueError: If the batch has another shape, does not continue the last one, or an entry
+                is not one number per step.
         """
         num_envs = self.open_sums.shape[0]
         if batch.ndim == num_envs == 1:
@@ -214,8 +217,10 @@ class EpisodeAccounting(Resumable):
         if batch.ndim != 2 or batch.shape[0] != num_envs:
             raise ValueError(
                 f"The batch has shape {list(batch.shape)}, but the accounting is for {num_envs} "
-                f"environments: it needs [{num_envs}, T], as the collector returns it."
+                f"environments: it needs [{num_envs}, T], as the collector returns it (of several "
+                "workers with cat_results=0)."
             )
+        self._check_continues(batch)
         columns = {key: self._column(batch, key) for key in self._signal_keys}
         observed = batch.select("observation", ("next", "observation"), strict=False)
         # actions last: a policy that observes NaN acts with NaN
@@ -249,6 +254,21 @@ class EpisodeAccounting(Resumable):
             steps_per_decision=self.steps_per_decision,
             steps=num_steps,
         )
+
+    def _check_continues(self, batch: TensorDictBase) -> None:
+        """Refuse a batch that is not of the same episodes as the end of the last one."""
+        ids = batch.get(("collector", "traj_ids"), None)
+        if ids is None:
+            return
+        ids = ids.reshape(batch.shape)
+        if self._open_ids is not None and ((ids[:, 0] != self._open_ids) & self.have_begun).any():
+            raise ValueError(
+                "This batch does not continue the episodes of the last one: episodes would be sums "
+                "of steps of several. An asynchronous collector returns batches of its workers in "
+                "turn: use MultiSyncCollector with cat_results=0. If the environments have been "
+                "reset, call forget_open_episodes() before."
+            )
+        self._open_ids = ids[:, -1].clone()
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:
         """Sums of the finished episodes, [E, m], from signals [N, T, m] and done [N, T]."""
@@ -286,8 +306,10 @@ class EpisodeAccounting(Resumable):
     def forget_open_episodes(self) -> None:
         """Drop the sums of unfinished episodes: the environment starts new ones."""
         self.open_sums.zero_()
+        self._open_ids = None
 
     def ignore_open_episodes(self) -> None:
         """Leave the present episodes, whose first steps are missing, out of all statistics."""
         # costs are known: risk measures charge every step of these episodes, too
         self.open_sums.zero_()[:, 0] = torch.nan
+        self._open_ids = None

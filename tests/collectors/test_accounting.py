@@ -49,6 +49,26 @@ class LoopAccounting:
         return finished, (self.cost / self.steps, self.speed_cost / self.steps)
 
 
+def test_batches_of_other_episodes_than_those_that_are_open_are_refused():
+    """As an asynchronous collector returns those of its workers in turn."""
+
+    def batch(ids, ends):
+        shape = (2, 3, 1)
+        done = torch.tensor(ends).expand(2, 3).unsqueeze(-1)
+        step = {"reward": torch.ones(shape), "cost": torch.ones(shape), "done": done}
+        names = torch.tensor(ids).expand(2, 3).unsqueeze(-1)
+        return TensorDict({"next": step, "collector": {"traj_ids": names}}, [2, 3])
+
+    accounting = EpisodeAccounting(2, ["cost"])
+    accounting.update(batch([4, 4, 4], [False, False, False]))
+    accounting.update(batch([4, 7, 7], [True, False, True]))
+    assert accounting.update(batch([9, 9, 9], [False] * 3)).lengths.tolist() == []
+    with pytest.raises(ValueError, match=r"does not continue the episodes.* cat_results=0"):
+        accounting.update(batch([8, 8, 8], [True] * 3))
+    accounting.forget_open_episodes()
+    assert accounting.update(batch([8, 8, 8], [False, False, True])).lengths.tolist() == [3.0] * 2
+
+
 def test_a_single_environment_needs_no_batch_dimension():
     generator = torch.Generator().manual_seed(0)
     batch = random_batch(generator, 1, 40, 0.2)
