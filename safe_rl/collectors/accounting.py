@@ -184,7 +184,7 @@ class EpisodeAccounting(Resumable):
         # changes sums of rewards far less than the digits that are logged
         self.open_sums = torch.zeros(num_envs, num_sums, dtype=torch.float64, device=device)
         self.totals = torch.zeros(num_sums, dtype=torch.float64, device=device)
-        self._open_ids: Tensor | None = None
+        self._last_ids: Tensor | None = None
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore the sums.
@@ -194,7 +194,7 @@ class EpisodeAccounting(Resumable):
                 number of steps of an episode that is left out is NaN.
         """
         super().load_state_dict(state_dict)
-        self._open_ids = None
+        self._last_ids = None
         sums = torch.cat([self.open_sums, self.totals[None]])
         sums[:-1, 0].masked_fill_(sums[:-1, 0].isnan(), 0.0)
         # the second column has rewards
@@ -261,14 +261,21 @@ class EpisodeAccounting(Resumable):
         if ids is None:
             return
         ids = ids.reshape(batch.shape)
-        if self._open_ids is not None and ((ids[:, 0] != self._open_ids) & self.have_begun).any():
-            raise ValueError(
-                "This batch does not continue the episodes of the last one: episodes would be sums "
-                "of steps of several. An asynchronous collector returns batches of its workers in "
-                "turn: use MultiSyncCollector with cat_results=0. If the environments have been "
-                "reset, call forget_open_episodes() before."
-            )
-        self._open_ids = ids[:, -1].clone()
+        if self._last_ids is not None:
+            is_another, goes_on = ids[:, 0] != self._last_ids, self.have_begun
+            if (is_another & goes_on).any():
+                raise ValueError(
+                    "This batch does not continue the episodes of the last one: episodes would be "
+                    "sums of steps of several. An asynchronous collector returns batches of its "
+                    "workers in turn: use MultiSyncCollector with cat_results=0. If the "
+                    "environments have been reset, call forget_open_episodes() before."
+                )
+            if not (is_another | goes_on).all():
+                raise ValueError(
+                    "Episodes go on that had ended ('done') in the last batch: use the collector "
+                    "with set_truncated=False."
+                )
+        self._last_ids = ids[:, -1].clone()
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:
         """Sums of the finished episodes, [E, m], from signals [N, T, m] and done [N, T]."""
@@ -306,10 +313,10 @@ class EpisodeAccounting(Resumable):
     def forget_open_episodes(self) -> None:
         """Drop the sums of unfinished episodes: the environment starts new ones."""
         self.open_sums.zero_()
-        self._open_ids = None
+        self._last_ids = None
 
     def ignore_open_episodes(self) -> None:
         """Leave the present episodes, whose first steps are missing, out of all statistics."""
         # costs are known: risk measures charge every step of these episodes, too
         self.open_sums.zero_()[:, 0] = torch.nan
-        self._open_ids = None
+        self._last_ids = None

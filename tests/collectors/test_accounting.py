@@ -6,6 +6,7 @@ import pytest
 import torch
 from point_mass import PointMass
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 
 from safe_rl.collectors import EpisodeAccounting, EpisodeError
 
@@ -67,6 +68,15 @@ def test_batches_of_other_episodes_than_those_that_are_open_are_refused():
         accounting.update(batch([8, 8, 8], [True] * 3))
     accounting.forget_open_episodes()
     assert accounting.update(batch([8, 8, 8], [False, False, True])).lengths.tolist() == [3.0] * 2
+
+
+def test_ends_of_batches_that_are_no_ends_of_episodes_are_refused():
+    accounting = EpisodeAccounting(2, ["cost"])
+    settings = {"frames_per_batch": 6, "total_frames": 12, "set_truncated": True}
+    first, second = (batch.clone() for batch in Collector(PointMass(2), **settings))
+    accounting.update(first)
+    with pytest.raises(ValueError, match="set_truncated=False"):
+        accounting.update(second)
 
 
 def test_a_single_environment_needs_no_batch_dimension():
