@@ -84,6 +84,7 @@ class Memory(Checked):
             MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
             for gamma, keys in keys_of.items()
         ]
+        self._open_ids: Tensor | None = None  # of the last steps' trajectories; -1: it has ended
         self._spanned = ["steps_to_next_obs"] if self._n_step_transforms else []
 
     def __len__(self) -> int:
@@ -91,11 +92,19 @@ class Memory(Checked):
         return len(self._buffer)
 
     def extend(self, batch: TensorDictBase) -> None:
-        """Add the steps [N, T] that follow those of the last call."""
+        """Add the steps [N, T] that follow those of the last call.
+
+        Where a collector's ``traj_ids`` say that they do not, sums over n steps end, too.
+        """
         if not self._n_step_transforms:
             self._add([batch])
             return
         wanted = batch.select(*{("next", "done"), *self.in_keys})
+        if (ids := batch.get(("collector", "traj_ids"), None)) is not None:
+            ids, last = ids.reshape(batch.shape), self._open_ids
+            if last is not None and ((last != ids[..., 0]) & (last >= 0)).any():
+                self.end_rows()
+            self._open_ids = ids[..., -1].masked_fill(wanted["next", "done"][..., -1, 0], -1)
         self._add([self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)])
 
     def _add(self, given: list[TensorDictBase | None]) -> None:
@@ -174,6 +183,7 @@ class Memory(Checked):
             self._buffer.extend(self._restored(state_dict["steps"], [size], self._spanned))
         self._buffer.writer.load_state_dict(writer)
         self._set_waiting(None)
+        self._open_ids = None
         if self._n_step_transforms and "tail" in state_dict:
             tail, shape = state_dict["tail"], state_dict["tail_shape"]
             self._set_waiting(self._restored(tail, shape, [("next", "done")]))

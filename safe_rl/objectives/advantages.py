@@ -1,8 +1,9 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
 Rollouts are [..., T] TensorDicts; time is the last dimension. A trajectory ends where ``("next",
-"done")`` is set, at the last step of the batch, and where the mask of a padded rollout ends. Unless
-it ends with ``("next", "terminated")``, the value of its last observation is bootstrapped.
+"done")`` is set, at the last step of the batch, and where the mask of a padded rollout ends or the
+collector's ``traj_ids`` change. Unless it ends with ``("next", "terminated")``, the value of its
+last observation is bootstrapped.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
             )
         reward = torch.cat(signals, -1)
         mask = sample_mask(tensordict)
-        ends = trajectory_ends(done, mask)
+        ends = trajectory_ends(done, mask, tensordict.get(("collector", "traj_ids"), None))
         value, following = self._values(tensordict, ends, params)
         next_value = following if next_value is None else next_value
         if value.shape != reward.shape:
@@ -180,8 +181,8 @@ class VectorGAE(Checked, ValueEstimatorBase):
                 f"{self.reward_keys} have {tuple(reward.shape)}: the value network needs one "
                 "output per signal."
             )
+        done = ends.unsqueeze(-1)
         if mask is not None:
-            done = ends.unsqueeze(-1)
             padded = ~mask.unsqueeze(-1)
             reward, value, next_value = (
                 signal.masked_fill(padded, 0.0) for signal in (reward, value, next_value)

@@ -12,13 +12,18 @@ from torchrl.objectives.value.functional import vec_generalized_advantage_estima
 from safe_rl.objectives.samples import FIRST, require, sample_mask
 
 
-def trajectory_ends(done: Tensor, mask: Tensor | None) -> Tensor:
+def trajectory_ends(done: Tensor, mask: Tensor | None, ids: Tensor | None) -> Tensor:
     """Where the trajectories of a rollout end, [..., T] bool, from ``done`` [..., T, 1].
 
-    The mask [..., T] is False where the rollout is padded; None without padding.
+    The mask [..., T] is False where the rollout is padded; None without padding. The collector's
+    ids of trajectories, or None, say where one follows another that has not ended: in rollouts that
+    were flattened, or in those of several workers behind each other.
     """
     ends = done.squeeze(-1).clone()
     ends[..., -1] = True
+    if ids is not None:
+        ids = ids.reshape(ends.shape)
+        ends |= ids != ids.roll(-1, -1)
     return ends if mask is None else (ends | ~mask.roll(-1, -1)) & mask
 
 

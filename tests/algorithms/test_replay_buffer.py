@@ -151,6 +151,20 @@ def test_rows_that_end_keep_no_step_back(length, ends):
         assert step["next", "terminated"].item() is (last in ends)
 
 
+def test_sums_do_not_go_on_in_other_trajectories():
+    """As in batches of asynchronous collectors."""
+    memory, ended = make_memory(n_steps=3), make_memory(n_steps=3)
+    for first, trajectory, is_last in ((0, 1, False), (4, 1, True), (50, 2, True)):
+        batch = make_batch(first, 4)
+        ended.extend(batch)
+        if is_last:
+            ended.end_rows()
+        batch["collector", "traj_ids"] = torch.full((2, 4), trajectory)
+        memory.extend(batch)
+    memory.end_rows()
+    assert torch.equal(*(m.state_dict()["steps"]["steps_to_next_obs"] for m in (memory, ended)))
+
+
 def test_a_copy_on_another_device_goes_on_there():
     memory, copy = (make_memory(n_steps=3, device=device) for device in ("cpu", "meta"))
     memory.extend(make_batch(0, 2))

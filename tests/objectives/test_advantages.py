@@ -79,6 +79,16 @@ def test_k_costs_at_once(keys):
     torch.testing.assert_close(out["cost_value_target"], target, atol=1e-5, rtol=1e-5)
 
 
+def test_trajectories_behind_each_other_are_not_one():
+    """As of workers with one environment each, in one dimension of time."""
+    critic = make_critic()
+    estimator = VectorGAE(critic, gamma=0.9, lmbda=0.9, value_target="lambda_return")
+    rollout = make_rollout([critic])
+    rollout["collector", "traj_ids"] = torch.arange(N).unsqueeze(-1).expand(N, T)
+    found = estimator(rollout.reshape(-1))["advantage"].reshape(N, T, 1)
+    torch.testing.assert_close(found, estimator(rollout)["advantage"])
+
+
 def test_each_observation_is_valued_once():
     critic = make_critic()
     rollout = make_rollout([critic])
