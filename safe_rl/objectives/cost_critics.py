@@ -38,7 +38,8 @@ class CostCritics(QFunctionLoss):
             `cost_values` says; by default one per cost.
         multiplier: λ; read at every call. It is not part of the loss or its ``state_dict``.
         cost_keys: Keys of the costs below ``next``, [..., 1] each. Transitions over n steps need
-            discounted sums of costs: name the costs in ``reward_keys`` of `MultiStepTransform`.
+            discounted sums of costs, and the end of their last step: `MultiStepTransform` with the
+            costs in ``reward_keys``, and ``done_keys=[]``.
         cost_gamma: Discount per step of the costs; None: that of the reward.
         cost_values: What the outputs of a critic mean; by default `MeanCosts`.
         pessimism: Number κ of standard deviations among the cost critics that is added to their

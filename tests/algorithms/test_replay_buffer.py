@@ -1,11 +1,16 @@
 """What a memory gives back: the transitions that went in, over one step or over several."""
 
+import re
+from pathlib import Path
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms import Memory
 
+PAGE = Path(__file__).parents[2] / "docs/coming_from/torchrl.md"
 IN_KEYS = [
     *("observation", "action"),
     *(("next", key) for key in ("observation", "reward", "cost", "terminated", "done")),
@@ -163,6 +168,15 @@ def test_sums_do_not_go_on_in_other_trajectories():
         memory.extend(batch)
     memory.end_rows()
     assert torch.equal(*(m.state_dict()["steps"]["steps_to_next_obs"] for m in (memory, ended)))
+
+
+def test_the_page_on_torchrl_names_the_settings_of_its_transform():
+    (named,) = re.findall(r"`MultiStepTransform` \| the same, with `(.*?)`", PAGE.read_text())
+    transform, memory = MultiStepTransform(3, 0.5, **eval(f"dict({named})")), make_memory(n_steps=3)
+    memory.extend(batch := make_batch(0, 9, rows=1, ends=[5]))
+    expected, found = memory.state_dict()["steps"], transform.inv(batch)["next"].flatten_keys("/")
+    for key in ("observation", "reward", "cost", "terminated"):
+        assert torch.equal(found[key][0], expected[f"next/{key}"])
 
 
 def test_a_copy_on_another_device_goes_on_there():
