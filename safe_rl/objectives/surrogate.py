@@ -169,7 +169,7 @@ class SurrogateLoss(Checked, SharesTensors):
         bonus = entropy(distribution)
         divergence = self._kl(tensordict, distribution, log_weight)
         out = self._evaluate(tensordict, log_weight, divergence.unsqueeze(-1))
-        out["loss_objective"] = self._reduce_loss(out["loss_objective"], tensordict)
+        out["loss_objective"] = self._reduce_loss(out["loss_objective"].squeeze(-1), tensordict)
         out["loss_entropy"] = -self.entropy_coeff * self._reduce_loss(bonus, tensordict)
         out["kl"] = self._reduce_loss(divergence.detach(), tensordict, reduction="mean")
         out["entropy"] = self._reduce_loss(bonus.detach(), tensordict, reduction="mean")

@@ -100,8 +100,9 @@ def test_reductions():
     batch = make_batch(actor, [4, 16])
     loss = PPOLoss(actor, **SETTINGS)
     loss.reduction = "none"
-    samples = loss(batch)["loss_objective"]
-    assert samples.shape == (4, 16, 1)
+    losses = loss(batch)
+    samples = losses["loss_objective"]
+    assert samples.shape == losses["loss_entropy"].shape == (4, 16)  # so that they can be added
     mean = PPOLoss(actor, **SETTINGS)(batch)["loss_objective"]
     torch.testing.assert_close(samples.mean(), mean)
 
