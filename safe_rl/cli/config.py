@@ -22,7 +22,7 @@ from pydantic import GetPydanticSchema, NonNegativeFloat, NonNegativeInt, Positi
 from safe_rl.checks import Device, SettingError, Text, check_value, rule
 from safe_rl.evaluation.settings import CertificateOptions
 from safe_rl.naming import join_keys, nearest
-from safe_rl.runs.identity import flatten, is_to_keep_limits
+from safe_rl.runs.identity import flatten, is_to_keep_limits, measure_of
 
 
 def typed(kind: Any) -> GetPydanticSchema:
@@ -234,10 +234,10 @@ def _check_together(config: DictConfig) -> None:
             "collector.num_collectors: collector=local is one process; for more use "
             "collector=process or collector=ray."
         )
-    measure = (config.get("risk") or {}).get("_target_")
-    if measure is not None and not is_to_keep_limits(config):
+    measure = measure_of(config)
+    if measure != "mean" and not is_to_keep_limits(config):
         raise SettingError(
-            f"risk={measure.rpartition('.')[2].lower()}: algo={config.algo.name} limits no costs, "
+            f"risk={measure.lower()}: algo={config.algo.name} limits no costs, "
             "so it would have no effect. Choose risk=mean, or an algorithm that keeps cost_limits."
         )
     if (cap := config.certificate.get("cap")) is not None:

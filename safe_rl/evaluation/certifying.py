@@ -137,12 +137,11 @@ def certify(
         statements = claims[chosen].statements(_costs(after))
         certificate = replace(
             certificate,
-            checkpoint=candidates[chosen],
+            checkpoint=_keep(run, candidates[chosen]),
             episode_return=after.returns.mean().item(),
             means={item.name: float(item.values.mean()) for item in statements},
             further=len(after.returns),
         )
-    certificate = replace(certificate, checkpoint=_keep(run, certificate.checkpoint))
     _write(run, certificate, [checkpoint_steps(path) for path in candidates])
     _remove_earlier(run, certificate.checkpoint)
     return certificate
@@ -294,10 +293,8 @@ def _side_by_side(policies: list[TensorDictModuleBase]) -> Callable[..., TensorD
     return policies[0] if len(policies) == 1 else act
 
 
-def _keep(run: Run, checkpoint: Path | None) -> Path | None:
+def _keep(run: Run, checkpoint: Path) -> Path:
     """Copy the certified checkpoint to a file that is not overwritten by later ones."""
-    if checkpoint is None:
-        return None
     kept = run.checkpoints_folder / "certified" / checkpoint.name
     kept.parent.mkdir(parents=True, exist_ok=True)
     with replacing(kept) as unfinished:

@@ -16,18 +16,14 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, StepRecorder
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
-from safe_rl.evaluation.loading import (
-    for_evaluation,
-    load_policy,
-    maker_of,
-    override_env,
-)
+from safe_rl.evaluation.loading import for_evaluation, load_policy, maker_of, override_env
 from safe_rl.evaluation.policies import writable_copy
 from safe_rl.evaluation.settings import EvaluationOptions, check_options
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.checkpoints import hold
 from safe_rl.runs.folder import checkpoint_steps
+from safe_rl.runs.identity import measure_of
 from safe_rl.runs.run import Run
 from safe_rl.scores.comparisons import LEVEL, Estimate, cvar, mean, share_over
 
@@ -111,7 +107,6 @@ class PolicyEvaluation:
             record: Folder to which all steps are written; None: they are not recorded.
         """
         options = self.options
-        risk = OmegaConf.select(self.config, "risk._target_") or "mean"
         limits = {key: float(limit) for key, limit in self.config.cost_limits.items()}
         with closing(self.make(min(options.num_envs, options.episodes))) as env:
             without_cost = {key: limits.pop(key) for key in [*limits] if key not in env.cost_keys}
@@ -138,7 +133,7 @@ class PolicyEvaluation:
             "seed": self.seed,
             "cost_limits": limits,
             "limits_without_cost": without_cost,
-            "limited_measure": risk.rpartition(".")[2],
+            "limited_measure": measure_of(self.config),
         }
 
     def film(self, file: Path, **drawing: Any) -> None:

@@ -132,8 +132,7 @@ class Claim:
 
     def shortfalls(self, costs: Costs, tests: int) -> dict[str, float]:
         """By how much bounds exceed their limits; empty if the claim is certified."""
-        bounds = self.bounds(costs, tests)
-        return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
+        return _shortfalls(self.bounds(costs, tests))
 
     def fewest(self, tests: int) -> float:
         """Number of episodes below which no test can succeed, even if no episode costs anything.
@@ -162,6 +161,10 @@ class Claim:
 
     def _level(self, tests: int) -> float:
         return 1 - (1 - self.level) / max(1, tests)
+
+
+def _shortfalls(bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    return {name: bound - most for name, (bound, most) in bounds.items() if bound > most}
 
 
 def _above(costs: np.ndarray, limit: float) -> np.ndarray:
@@ -254,16 +257,15 @@ def first_certified(
         1
     """
     verdicts: list[Verdict] = []
-    tested: list[int] = []
     for candidate in order[:tests]:
-        tested.append(candidate)
         verdict = _test(candidate, collect(candidate), claims[candidate], tests, episodes)
-        verdicts.append(replace(verdict, tested=tested))
+        verdicts.append(verdict)
         if verdict.certified is not None:
-            return verdicts[-1]
+            return replace(verdict, tested=list(order[: len(verdicts)]))
     # by how much the worst bound of each candidate exceeds its limit, in the units of `rank`
     excess = [max((b - d) / max(d, 1.0) for b, d in v.bounds.values()) for v in verdicts]
-    return verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, tested)
+    closest = verdicts[int(np.argmin(excess))] if verdicts else Verdict(None, [])
+    return replace(closest, tested=list(order[:tests]))
 
 
 def _test(
@@ -277,7 +279,8 @@ def _test(
         number = min((len(values) for values in costs.values()), default=episodes)
         if number >= episodes or claim.may_end(costs, tests, episodes):
             break
-    bounds, missing = claim.bounds(costs, tests), claim.shortfalls(costs, tests)
+    bounds = claim.bounds(costs, tests)
+    missing = _shortfalls(bounds)
     statements = claim.statements(costs)
     return Verdict(
         certified=None if missing else candidate,
