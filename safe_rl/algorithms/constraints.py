@@ -108,13 +108,13 @@ class Constraints(Resumable):
                 f"algo={config.algo.name} needs at least one entry in cost_limits, for example "
                 "cost_limits='{cost: 25}'. Without constraints use algo=ppo or algo=sac."
             )
-        limits, tracker, risk = limits if config.algo.constrained else {}, None, None
         max_length = math.ceil(env.max_episode_steps / env.steps_per_decision)
-        if limits:
-            values = torch.tensor(list(limits.values()))
-            known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
-            risk = instantiate(config.get("risk"), known, cost_limits=values)
-            tracker = instantiate(config.get("limits"), known, cost_limits=values)
+        if not config.algo.constrained:
+            return cls({}, max_length=max_length, device=config.device)
+        values = torch.tensor(list(limits.values()))
+        known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
+        risk = instantiate(config.get("risk"), known, cost_limits=values)
+        tracker = instantiate(config.get("limits"), known, cost_limits=values)
         return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
 
     @property

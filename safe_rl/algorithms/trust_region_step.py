@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from annotated_types import Interval
@@ -203,27 +202,26 @@ class TRPOStep(PolicyUpdate):
     def _search(
         self, batch: TensorDictBase, reference: ReferencePolicy, proposal: Proposal
     ) -> dict[str, Tensor]:
-        tried: dict[str, Any] = {}
+        divergences: list[Tensor] = []  # of every try
+        losses: list[TensorDictBase] = []  # of those within the trust region
 
         def accept() -> bool:
-            tried["kl"] = mean_kl(reference, self.actor_network, batch)
-            if not tried["kl"] <= self.target_kl:
+            divergences.append(mean_kl(reference, self.actor_network, batch))
+            if not divergences[-1] <= self.target_kl:
                 return False
-            tried["losses"] = self.loss(batch)
-            return proposal.is_acceptable(tried["losses"], tried["kl"])
+            losses.append(self.loss(batch))
+            return proposal.is_acceptable(losses[-1], divergences[-1])
 
         max_tries = self.max_backtracks if proposal.step.any() else 0
         fraction = backtracking_search(
             self.parameters, proposal.step, accept, coeff=self.backtrack_coeff, max_tries=max_tries
         )
-        if not fraction:
-            tried = {"kl": proposal.step.new_zeros(()), "losses": self.loss(batch)}
-        tries = max_tries if not fraction else math.log(fraction, self.backtrack_coeff)
+        after = losses[-1] if fraction else self.loss(batch)
         return {
-            **tried["losses"].to_dict(),
-            "kl": tried["kl"],
+            **after.to_dict(),
+            "kl": divergences[-1] if fraction else proposal.step.new_zeros(()),
             "step_fraction": torch.tensor(fraction),
-            "backtracks": torch.tensor(round(tries)),
+            "backtracks": torch.tensor(len(divergences) - bool(fraction)),
         }
 
     def loss_modules(self) -> dict[str, nn.Module]:

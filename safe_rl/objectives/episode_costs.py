@@ -206,14 +206,14 @@ class EpisodeCosts(Resumable):
             batch = batch._replace(mean=batch.mean + penalised.offset)
         self.batch = batch
         if self.drift is not None:
-            size = self._size(self.estimate.mean)
+            size = self.scale(self.estimate.mean)
             expected = batch._replace(error=self._expected_error(batch, size))
             batch = shrink(self.estimate, expected, self.drift * size)
         self._mean, self._error = batch
         return batch
 
-    def _size(self, mean: Tensor) -> Tensor:
-        """J_c, or its lower bound `smallest`, [k]."""
+    def scale(self, mean: Tensor) -> Tensor:
+        """A J_c, or that of `smallest` costs per step if it is larger, [k]."""
         return torch.maximum(mean, self.smallest * self.lengths.mean * self.unit)
 
     def _expected_error(self, batch: CostEstimate, size: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ class EpisodeCosts(Resumable):
         the estimate would be too low. So the variance is assumed to be proportional to J_c, as for
         counts. The factor of proportionality is estimated.
         """
-        seen = torch.stack([batch.error.square(), self._size(batch.mean)])
+        seen = torch.stack([batch.error.square(), self.scale(batch.mean)])
         self._scatter = torch.lerp(seen, self._scatter, self.decay)
         squared, sizes = self._scatter
         error = (squared / sizes * size).sqrt()

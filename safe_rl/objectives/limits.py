@@ -9,8 +9,7 @@ are in `docs/algorithms/holding_the_limit.md`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -139,11 +138,8 @@ class LimitState:
 
     def to(self, like: Tensor) -> LimitState:
         """The same with the dtype and device of a tensor."""
-        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        tensors: dict[str, Any] = {
-            k: v.to(like) for k, v in values.items() if isinstance(v, Tensor)
-        }
-        return replace(self, **tensors)
+        tensors = {name: v.to(like) for name, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **tensors)  # type: ignore[arg-type]
 
 
 class PredictedChange(Resumable):
@@ -266,13 +262,12 @@ class LimitTracker(Checked, Resumable):
         self.descent_steps = round(descent_steps * shrinkage)
         self._is_shortened = shrinkage < 1
         self.decay, self.steps_per_decision = decay, steps_per_decision
-        self.smallest_scale = smallest_scale
         self.costs = EpisodeCosts(
             num_costs,
             max_length=max_length,
             drift=drift,
             decay=decay,
-            smallest=self.smallest_scale,
+            smallest=smallest_scale,
         )
         self.predictions = PredictedChange(num_costs, decay=decay, lowest=lowest_realised_share)
         self.integral, self.largest_integral = integral, largest_integral
@@ -311,8 +306,7 @@ class LimitTracker(Checked, Resumable):
         if penalised is not None:
             self.limits = penalised.limit
         batch = self.costs.batch
-        smallest = self.smallest_scale * self.costs.lengths.mean * self.costs.unit
-        scale = torch.maximum(self.limits, smallest)
+        scale = self.costs.scale(self.limits)
         self.predictions.update(batch.mean, prior=0.5 * scale)
         noise = torch.lerp(batch.error, self._noise, self.decay)
         self._noise = torch.where(noise.isfinite(), noise, batch.error)

@@ -13,11 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from safe_rl.checks import Checked
-from safe_rl.objectives.distributions import (
-    entropy,
-    kl,
-    sampler_of,
-)
+from safe_rl.objectives.distributions import entropy, kl, sampler_of
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import SharesTensors, inputs_of, require, sample_mask
