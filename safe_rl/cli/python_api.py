@@ -155,9 +155,11 @@ def _carry_out(
 ) -> Run:
     with open_dict(config):
         hydra = config.pop("hydra")
-    options: dict[str, Any] = {"continues": continues, "callbacks": callbacks, "program": None}
+    notes = None if continues else hydra
     try:
-        training.train(config, folder, hydra=None if continues else hydra, **options)
+        training.train(
+            config, folder, hydra=notes, continues=continues, callbacks=callbacks, program=None
+        )
     except SystemExit as end:
         if end.code == 128 + SIGINT:
             raise KeyboardInterrupt from None

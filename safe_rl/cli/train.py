@@ -51,23 +51,23 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
         SystemExit: With a message of one line, if the words cannot be used.
     """
     keep_streams()
-    before = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises its errors, and does not print them
     try:
         sys.argv = [sys.argv[0], *prepare(sys.argv[1:] if words is None else words)]
         main()
     except (*COMPOSITION_ERRORS, OSError) as error:
         # the user wants to see the traceback, or has to
-        if before[1] == "1" or UNEXPECTED in getattr(error, "__notes__", ()):
+        if full_error == "1" or UNEXPECTED in getattr(error, "__notes__", ()):
             raise
         sys.exit(printable(explain(error, sys.argv[1:])))
     except KeyboardInterrupt:
         end_by_interrupt()
     finally:
-        sys.argv = before[0]
+        sys.argv = argv
         os.environ.pop("HYDRA_FULL_ERROR")
-        if before[1] is not None:
-            os.environ["HYDRA_FULL_ERROR"] = before[1]
+        if full_error is not None:
+            os.environ["HYDRA_FULL_ERROR"] = full_error
 
 
 def prepare(words: Sequence[str]) -> list[str]:

@@ -99,19 +99,14 @@ class ConstrainedEnv(EnvBase):
         actions as policies choose them, ``low`` and ``high``, and in the environment's own units,
         ``own_low`` and ``own_high``; None for choices. ``steps_per_decision`` is the attribute.
         """
-        raw, spec, actions = self.action_bounds, self.action_spec_unbatched, None
-        if raw is not None:
-            bounds = {
-                "low": spec.low,
-                "high": spec.high,
-                "own_low": raw[0],
-                "own_high": raw[1],
-            }
+        actions = None
+        if (own := self.action_bounds) is not None:
+            spec = self.action_spec_unbatched
+            bounds = {"low": spec.low, "high": spec.high, "own_low": own[0], "own_high": own[1]}
             actions = {name: bound.flatten().tolist() for name, bound in bounds.items()}
-        sensors = dict(self.sensor_keys)
         return {
             "columns": self.column_names,
-            "sensors": sensors,
+            "sensors": dict(self.sensor_keys),
             "actions": actions,
             "steps_per_decision": self.steps_per_decision,
         }

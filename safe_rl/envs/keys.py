@@ -12,7 +12,6 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Optional, Union, get_args, get_origin
 
 from annotated_types import Interval
-from pydantic import ValidationError
 
 from safe_rl import checks
 from safe_rl.checks import SettingError, rule
@@ -55,13 +54,11 @@ adapter = cache(checks.adapter)
 
 def checked(name: str, annotation: Any, value: Any) -> Any:
     """Return a value with the type of its key; ConfigError if the type or range is wrong."""
+    check = adapter(annotation)
     try:
-        return adapter(annotation).validate_python(as_plain(value))
-    except ValidationError:
-        try:
-            return checks.check_value(name, annotation, as_plain(value))
-        except SettingError as error:
-            raise ConfigError(str(error)) from None
+        return check.validate_python(checks.check_value(name, check, as_plain(value)))
+    except SettingError as error:
+        raise ConfigError(str(error)) from None
 
 
 def as_plain(value: Any) -> Any:

@@ -74,8 +74,7 @@ class RunWriter:
                 opened.callback(self._logger.close)
             self._table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             if self._logger is not None and not epoch:
-                given = given_settings(self.run.overrides or (), self.config)
-                self._logger.log_hparams(given)
+                self._logger.log_hparams(given_settings(self.run.overrides or (), self.config))
             # whole batches, so that the last one does not go beyond the bar
             batch = self.config.frames_per_batch
             total = math.ceil(self.config.frames / batch) * batch

@@ -65,7 +65,7 @@ class Trainer:
         evaluation: Evaluator | None = None,
         recording: Recording | None = None,
     ) -> None:
-        self.algorithm, config = algorithm, writer.config
+        self.algorithm, self._config = algorithm, writer.config
         self.accounting = EpisodeAccounting(
             env.batch_size.numel(),
             env.cost_keys,
@@ -83,16 +83,15 @@ class Trainer:
         self.snapshot = None
         if isinstance(collector, Collector) and env.get_state() is not None:
             self.snapshot = EnvSnapshot(env, collector)
-        self._first_steps = staggered_steps(env) if config.get("staggered_starts") else None
+        self._first_steps = staggered_steps(env) if self._config.get("staggered_starts") else None
         if self._first_steps is not None:
             (self.snapshot or collector).stagger(self._first_steps)
             self.accounting.ignore_open_episodes()
-        self._frames, self._checkpoint_interval = config.frames, config.checkpoint.interval
         self._open_checkpoints()
 
     def _open_checkpoints(self) -> None:
         """Name the parts of a checkpoint, choose those of a policy, and open the run's store."""
-        config = self.writer.config
+        config = self._config
         parts: dict[str, Stateful] = {
             **self.algorithm.checkpoint_components(),
             "accounting": self.accounting,
@@ -138,7 +137,7 @@ class Trainer:
     @property
     def is_finished(self) -> bool:
         """Whether no signal has ended the training before its last step."""
-        return self.stopped_by is None or self.progress.steps >= self._frames
+        return self.stopped_by is None or self.progress.steps >= self._config.frames
 
     def _begin_episodes(self) -> None:
         """Begin new episodes: the state of the environments was not saved."""
@@ -195,7 +194,7 @@ class Trainer:
                     self._selection.take(row)
                 # if the run was shorter before, these were scored by fewer epochs at its end
                 self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
-            while self.progress.steps < self._frames:
+            while self.progress.steps < self._config.frames:
                 row = self.epoch(batches)
                 self.writer.add(row)
                 for policy in self._selection.add(row):
@@ -206,7 +205,7 @@ class Trainer:
                     break
                 if signals:  # checked after an epoch: every run has at least one
                     break
-                if time.monotonic() - saved_at > self._checkpoint_interval:
+                if time.monotonic() - saved_at > self._config.checkpoint.interval:
                     self._save()
                     saved_at = time.monotonic()
             self.stopped_by = signals[0] if signals else None

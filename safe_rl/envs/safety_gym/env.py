@@ -106,8 +106,8 @@ class SafetyGymEnv(SimulatedEnv):
         scene = build_scene(self.config, sleep and self.config.physics == "cpu")
         bodies = slice(1, scene.free_bodies.start)
         self._physics = physics = self._make_physics(scene.model, bodies, num_threads)
-        self.seconds_per_step = self._physics.timestep * self.config.frameskip_binom_n
-        self._world = make_world(scene, self._physics)
+        self.seconds_per_step = physics.timestep * self.config.frameskip_binom_n
+        self._world = make_world(scene, physics)
         self._plan = plan_placements(scene, physics.device)
         draw = partial(draw_layouts, self._plan, physics)
         shape = (num_envs, self._plan.num_columns, 2)

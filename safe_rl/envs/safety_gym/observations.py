@@ -226,7 +226,7 @@ def make_observer(scene: Scene, device: torch.device, others: Sequence[Block] = 
                 "observation that was registered."
             )
     unordered: Shapes = {name: shape for block in blocks for name, shape in block.shapes.items()}
-    shapes = {name: unordered[name] for name in sorted(unordered)}
+    shapes = dict(sorted(unordered.items()))
     read_at, columns = (
         add_columns({}, {name: math.prod(shape) for name, shape in each.items()})
         for each in (unordered, shapes)
