@@ -265,9 +265,9 @@ class EpisodeAccounting(Resumable):
             is_another, goes_on = ids[:, 0] != self._last_ids, self.have_begun
             if (is_another & goes_on).any():
                 raise ValueError(
-                    "This batch does not continue the episodes of the last one: episodes would be "
-                    "sums of steps of several. An asynchronous collector returns batches of its "
-                    "workers in turn: use MultiSyncCollector with cat_results=0. If the "
+                    "This batch does not continue the episodes of the last one: steps of several "
+                    "episodes would be summed up as one. An asynchronous collector returns batches "
+                    "of its workers in turn: use MultiSyncCollector with cat_results=0. If the "
                     "environments have been reset, call forget_open_episodes() before."
                 )
             if not (is_another | goes_on).all():

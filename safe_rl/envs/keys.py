@@ -56,6 +56,7 @@ def checked(name: str, annotation: Any, value: Any) -> Any:
     """Return a value with the type of its key; ConfigError if the type or range is wrong."""
     check = adapter(annotation)
     try:
+        # check_value returns the value as it is; this converts it to the type, as a list to a tuple
         return check.validate_python(checks.check_value(name, check, as_plain(value)))
     except SettingError as error:
         raise ConfigError(str(error)) from None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -138,8 +139,8 @@ class LimitState:
 
     def to(self, like: Tensor) -> LimitState:
         """The same with the dtype and device of a tensor."""
-        tensors = {name: v.to(like) for name, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **tensors)  # type: ignore[arg-type]
+        tensors: Any = {k: v.to(like) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        return replace(self, **tensors)
 
 
 class PredictedChange(Resumable):

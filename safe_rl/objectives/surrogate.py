@@ -54,6 +54,9 @@ class SurrogateLoss(Checked, SharesTensors):
         actor_network: Policy with `get_dist`, such as a `torchrl.modules.ProbabilisticActor`.
         entropy_coeff: Factor of the entropy bonus. It is a buffer, so that it can be scheduled,
             even if it is 0 at first.
+
+    Raises:
+        TypeError: If the policy samples several entries, as one with a composite distribution does.
     """
 
     @dataclass
@@ -96,6 +99,11 @@ class SurrogateLoss(Checked, SharesTensors):
         self.multiplier: Multiplier | None = None
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
         sampler = sampler_of(actor_network)
+        if len(sampler.dist_sample_keys) > 1:
+            raise TypeError(
+                f"actor_network samples {sampler.dist_sample_keys}: losses take policies that "
+                "sample one entry, so no composite distributions. Join the parts of the action."
+            )
         names = [name if isinstance(name, str) else name[-1] for name in sampler.dist_keys]
         self._parameter_keys = dict(zip(names, sampler.in_keys, strict=True))
         self.set_keys(**{k: v for k, v in self._parameter_keys.items() if k in ("loc", "scale")})

@@ -8,7 +8,7 @@ import torch
 from policy_kinds import KINDS, SAMPLED_KL, make_actor, make_case
 from samples import NUM_OBS, assert_gradients_are_differences, limit_state, perturb
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import CompositeDistribution, TensorDictModule
 from torch import nn
 from torch.distributions import Categorical, Independent, kl_divergence
 from torchrl.modules import MaskedCategorical, ProbabilisticActor, TanhNormal
@@ -182,9 +182,24 @@ def test_parameters_are_read_where_the_actor_writes_them():
         actor(batch)
     batch["advantage"] = torch.randn(8, 1)
     assert loss(batch)["kl"] == 0
+    wrong = batch.clone()
+    wrong["pi", "logits"][3, 0] = torch.nan
+    with pytest.raises(FloatingPointError, match=r"logits.*1 of 8"):
+        TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)(wrong)
     del batch["pi", "logits"]
     with pytest.raises(KeyError, match="behaviour policy's"):
         loss(batch)
+
+
+def test_a_policy_of_several_actions_is_refused():
+    parts = {"wheel": Categorical, "gear": Categorical}
+    actor = ProbabilisticActor(
+        TensorDictModule(nn.Identity(), ["params"], ["params"]),
+        in_keys=["params"], out_keys=["wheel", "gear"], return_log_prob=True,
+        distribution_class=functools.partial(CompositeDistribution, distribution_map=parts),
+    )  # fmt: skip
+    with pytest.raises(TypeError, match=r"samples \['wheel', 'gear'\].* no composite"):
+        PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
 
 
 PROJECTIONS = {
