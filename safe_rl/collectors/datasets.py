@@ -139,7 +139,7 @@ def read_hdf5(path: Path | str) -> TensorDict:
     - DSRL and D4RL: flat arrays over all episodes, ``observations``, ``actions``, ``rewards``,
       ``costs``, ``terminals``, ``timeouts``, and ``next_observations``. If the last array is
       missing, a step's next observation is the observation of the step after it, or, at the end of
-      an episode, the step's own observation;
+      an episode, the step's own observation, also where the array has the next episode's first;
     - Minari: a group ``episode_<i>`` for each episode, with ``observations`` (one more than steps),
       ``actions``, ``rewards``, ``terminations``, ``truncations``, and ``infos`` with ``cost`` and
       any ``cost_<kind>``, one per step, or one more with the reset's 0 first. An episode without
@@ -147,7 +147,7 @@ def read_hdf5(path: Path | str) -> TensorDict:
 
     Raises:
         ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or does not
-            have one row of numbers for each action.
+            have one row of numbers for each action; if a flag is neither 0 nor 1.
         ModuleNotFoundError: If h5py is not installed.
     """
     with open_hdf5(path) as file:
@@ -221,14 +221,17 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
     arrays = _check_shapes(path, {**arrays, ("next", "observation"): following})
     if np.array_equal(following, here) and (here != here[:1]).any():
         raise ValueError(f"{path}: its next_observations are equal to its observations.")
-    is_next = np.isclose(following[:-1], here[1:], 1e-4, 1e-6, equal_nan=True)
-    gaps = ~is_next.all(tuple(range(1, here.ndim))) & ~ends[:-1]
+    is_close = np.isclose(following[:-1], here[1:], 1e-4, 1e-6, equal_nan=True)
+    is_next = is_close.all(tuple(range(1, here.ndim)))
+    gaps = ~is_next & ~ends[:-1]
     if gaps.any():
         raise ValueError(
             f"{path}: another observation follows its step {gaps.argmax()} than next_observations "
             "says, and no episode ends there. Put steps in order of time, and mark every end of an "
             "episode in terminals or timeouts."
         )
+    # of an array made by a shift: values of truncated steps would be those of the next episode
+    following[:-1][ends[:-1] & is_next] = here[:-1][ends[:-1] & is_next]
     return arrays
 
 
@@ -236,7 +239,7 @@ def _read_episode(place: str, group: Any) -> Arrays:
     nodes = _nodes(place, group)
     arrays = _arrays(place, nodes, _OF_AN_EPISODE)
     observed, number = arrays["observation"], len(arrays["action"])
-    arrays |= {"observation": observed[:number], ("next", "observation"): observed[1 : number + 1]}
+    arrays |= {"observation": observed[:number], ("next", "observation"): observed[1:]}
     infos = _nodes(place, nodes.get("infos", {}))
     for name, node in infos.items():
         if name.startswith("cost") and _is_array(node):
@@ -264,6 +267,9 @@ def _arrays(place: Path | str, nodes: Mapping[str, Any], names: Mapping[NestedKe
             f"DSRL or Minari. What it has: {printable(', '.join(present)) or 'nothing'}."
         )
     arrays = {key: _values(place, nodes[name]) for key, name in names.items()}
+    for key in _FLAGS:
+        if not np.isin(arrays[key], (0, 1)).all():
+            raise ValueError(f"{place}: its {names[key]} must be 0 or 1.")
     return arrays | {key: arrays[key].astype(bool) for key in _FLAGS}
 
 

@@ -141,12 +141,17 @@ def test_files_of_offline_benchmarks_are_read(tmp_path, h5py):
     assert steps["next", "terminated"].flatten().tolist().count(True) == 1
 
 
-def test_what_follows_a_step_is_the_next_observation_where_a_file_does_not_say(tmp_path, h5py):
+@pytest.mark.parametrize("is_shifted", [False, True])
+def test_the_next_observation_is_never_another_episodes(is_shifted, tmp_path, h5py):
+    """Files without next_observations, and those where it was made by a shift."""
     arrays = write_hdf5(h5py, tmp_path / "data.hdf5", leave_out=["next_observations"])
+    seen = arrays["observations"]
+    if is_shifted:
+        with h5py.File(tmp_path / "data.hdf5", "a") as file:
+            file["next_observations"] = np.append(seen[1:], seen[-1:], 0)
     steps = read_dataset(tmp_path / "data.hdf5")
     rows = [1, 2, 2, 4, 5, 5]  # episodes end with the third step and the sixth
-    expected = torch.tensor(arrays["observations"][rows]).float()[None]
-    torch.testing.assert_close(steps["next", "observation"], expected)
+    torch.testing.assert_close(steps["next", "observation"], torch.tensor(seen[rows]).float()[None])
 
 
 def write_minari(h5py, path, lengths=(3, 12), reset_infos=True):
@@ -212,6 +217,7 @@ def test_what_is_no_dataset_is_refused(tmp_path, h5py):
         ({"next_observations": np.zeros((6, 4))}, r"numbers of shape \(6, 3\),.* shape \(6, 4\)"),
         ({"next_observations": "observations"}, "next_observations are equal to its observations"),
         ({"next_observations": np.ones((6, 3))}, "another observation follows its step 0 than"),
+        ({"terminals": np.array([0, np.nan, 0, 0, 0, 0])}, "its terminals must be 0 or 1"),
     ],
 )
 def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_path, h5py):
@@ -295,6 +301,7 @@ def test_a_file_with_flipped_bits_is_read_or_refused_in_one_line(tmp_path, h5py)
     ("name", "array", "told"),
     [
         ("observations", np.zeros((1, 3)), "episode_4: the next observation must be"),
+        ("observations", np.zeros((3, 3)), "episode_4: the next observation must be"),
         ("infos/cost", np.zeros((1, 2)), "episode_4: the next cost must be"),
         ("infos/cost", np.zeros(3), "episode_4: the next cost must be"),
         ("infos/cost", np.ones(2), "episode_4: the next cost must be"),
