@@ -138,8 +138,9 @@ def read_hdf5(path: Path | str) -> TensorDict:
 
     - DSRL and D4RL: flat arrays over all episodes, ``observations``, ``actions``, ``rewards``,
       ``costs``, ``terminals``, ``timeouts``, and ``next_observations``. If the last array is
-      missing, a step's next observation is the observation of the step after it, or, at the end of
-      an episode, the step's own observation, also where the array has the next episode's first;
+      missing, a step's next observation is the observation of the step after it. At the end of an
+      episode it is then the step's own observation. The same holds for an end at which the array
+      has the first observation of the next episode;
     - Minari: a group ``episode_<i>`` for each episode, with ``observations`` (one more than steps),
       ``actions``, ``rewards``, ``terminations``, ``truncations``, and ``infos`` with ``cost`` and
       any ``cost_<kind>``, one per step, or one more with the reset's 0 first. An episode without
@@ -214,10 +215,8 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
     arrays = _check_shapes(path, _arrays(path, nodes, _FLAT))
     here = arrays["observation"]
     ends = (arrays["next", "terminated"] | arrays["next", "truncated"]).reshape(-1)
-    if "next_observations" not in nodes:
-        is_last = np.append(ends[:-1], True).reshape(-1, *[1] * (here.ndim - 1))
-        return {**arrays, ("next", "observation"): np.where(is_last, here, np.roll(here, -1, 0))}
-    following = _values(path, nodes["next_observations"])
+    is_given = "next_observations" in nodes
+    following = _values(path, nodes["next_observations"]) if is_given else np.roll(here, -1, 0)
     arrays = _check_shapes(path, {**arrays, ("next", "observation"): following})
     if np.array_equal(following, here) and (here != here[:1]).any():
         raise ValueError(f"{path}: its next_observations are equal to its observations.")
@@ -230,9 +229,10 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
             "says, and no episode ends there. Put steps in order of time, and mark every end of an "
             "episode in terminals or timeouts."
         )
-    # of an array made by a shift: values of truncated steps would be those of the next episode
-    following[:-1][ends[:-1] & is_next] = here[:-1][ends[:-1] & is_next]
-    return arrays
+    # at an end, an array made by a shift has the next episode's first observation, from which
+    # losses would take the value of what follows a truncated step
+    is_of_next = np.append(ends[:-1] & is_next, not is_given).reshape(-1, *[1] * (here.ndim - 1))
+    return {**arrays, ("next", "observation"): np.where(is_of_next, here, following)}
 
 
 def _read_episode(place: str, group: Any) -> Arrays:
