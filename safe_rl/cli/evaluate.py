@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from safe_rl.cli.options import OptionError, run_command
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
-
-if TYPE_CHECKING:
-    from safe_rl.evaluation.variations import Varied
 
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
@@ -21,7 +17,7 @@ def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluat
 
 
 def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:
-    """Evaluate or certify a run, or run it under variations, and print the results."""
+    """Evaluate or certify a run, and print the results."""
     from safe_rl.evaluation import evaluate  # with torch: help does not need it
     from safe_rl.evaluation.policies import find_run
 
@@ -30,25 +26,8 @@ def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] |
     import_modules(modules)
     if options.certify:
         return _certify(directory, options)
-    if options.variations is not None:
-        varied, picture = evaluate_varied(directory, options, progress=True)
-        print(varied, f"wrote {varied.file}", f"wrote {picture}", sep="\n")
-    else:
-        print(evaluate(directory, options, progress=True))
+    print(evaluate(directory, options, progress=True))
     return 0
-
-
-def evaluate_varied(
-    directory: Path, options: EvaluationOptions, *, progress: bool = False
-) -> tuple[Varied, Path]:
-    """Run a policy under ``options.variations``; return the results, and the path of a picture."""
-    from safe_rl.evaluation.variations import evaluate_variations
-    from safe_rl.reporting.figures import draw_variations
-
-    varied = evaluate_variations(directory, options, progress=progress)
-    picture = varied.file.with_suffix(".png")
-    draw_variations(varied.rows, varied.cost_limits, picture)
-    return varied, picture
 
 
 def _certify(directory: Path, options: EvaluationOptions) -> int:

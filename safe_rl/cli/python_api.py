@@ -28,13 +28,11 @@ from safe_rl.cli.composing import (
     refuse_changes,
 )
 from safe_rl.cli.config import check_settings
-from safe_rl.cli.evaluate import evaluate_varied
 from safe_rl.cli.options import make_options
 from safe_rl.evaluation import Certificate, Evaluation, EvaluationOptions, loading, measuring
 from safe_rl.evaluation.certifying import certify_run
 from safe_rl.evaluation.episodes import default_seed
 from safe_rl.evaluation.policies import find_run
-from safe_rl.evaluation.variations import Varied
 from safe_rl.extras import import_extra
 from safe_rl.files import read_bounded
 from safe_rl.models import HeldActions
@@ -338,14 +336,3 @@ class Run(RecordedRun):
             ValueError: If there is no such key, or it cannot have the value.
         """
         return certify_run(self.directory, changes=changes)
-
-    def vary(self, variations: Any, **options: Any) -> Varied:
-        """Run the policy under variations of its environment; write the command's files.
-
-        Args:
-            variations: As the command's ``variations=``: ``"dynamics"``, or custom rows,
-                ``{"mass": {"env.mass_scale": [0.5, 2.0]}}``.
-            options: Those of `safe_rl.evaluation.EvaluationOptions`.
-        """
-        given = {"checkpoint": self.checkpoint, "variations": variations, **options}
-        return evaluate_varied(self.directory, make_options(given, EvaluationOptions))[0]

@@ -1,4 +1,4 @@
-"""Evaluation of a trained policy: whole episodes, estimates, certificates, variations, videos."""
+"""Evaluation of a trained policy: whole episodes, estimates, certificates, videos."""
 
 from typing import TYPE_CHECKING
 

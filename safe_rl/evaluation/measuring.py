@@ -171,12 +171,12 @@ def evaluate(
         OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If options exclude or need each other, or ask for a certificate or for
-            variations, or the environment cannot be drawn.
+        ValueError: If options exclude or need each other, or ask for a certificate, or the
+            environment cannot be drawn.
     """
     check_options(options)
-    if options.certify or options.variations is not None:
-        raise ValueError("evaluate: certificates are made by certify(), variations by vary(…).")
+    if options.certify:
+        raise ValueError("evaluate: certificates are made by certify().")
     directory = writable_copy(directory)
     run = Run(directory)
     config = run.config

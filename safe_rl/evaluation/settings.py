@@ -69,9 +69,6 @@ class EvaluationOptions(CheckedOptions):
     name: Annotated[str, _NAME] = option(
         "", "suffix of the files, to keep several evaluations of a run"
     )
-    variations: Any = option(
-        None, "evaluate in changed environments: dynamics, sensing, layout, a YAML, keys"
-    )
     env: dict[str, Any] = option(
         dict, "keys of the environment, as in training: env.hazards_num=12"
     )
@@ -115,11 +112,6 @@ def check_options(options: EvaluationOptions) -> None:
     if options.certificate and not options.certify:
         raise ValueError("certificate.…: it is the certificate's: add certify=true.")
     films = options.video or options.picture
-    if options.variations is not None and (films or options.record or options.certify):
-        raise ValueError(
-            "variations=… cannot be combined with video=true, picture=…, record=true or "
-            "certify=true: leave them out."
-        )
     if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
     folder = Path(options.picture or "").parent

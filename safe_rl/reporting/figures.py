@@ -1,4 +1,4 @@
-"""Pictures of final scores and variations; styles, legends and files of all pictures."""
+"""Pictures of final scores; styles, legends and files of all pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from safe_rl.reporting.experiments import PACKAGED, Experiment
 from safe_rl.reporting.tables import Record, short_number
 from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import ALGORITHMS
-from safe_rl.scores.comparisons import Estimate, pareto_front
+from safe_rl.scores.comparisons import pareto_front
 
 # colours and markers of the package's algorithms; those of the paper come first, in colours of
 # Okabe and Ito that colour-blind readers can distinguish
@@ -37,8 +37,6 @@ LIMIT_STYLE: dict[str, Any] = {"color": "#c00000", "linestyle": "--", "linewidth
 WIDTH = 12.0
 """Width of a figure [inch]."""
 _LEGEND, _LONGEST_LABEL = 140, 60  # widths of a legend and of a line in it [letters]
-_PANEL, _MOST_COLUMNS = (2.2, 2.0), 5  # of variations: width and height [inch]; in a row
-_NONE = Estimate(math.nan, math.nan, math.nan)  # of a cost that a variation does not have
 
 
 class Style(NamedTuple):
@@ -178,58 +176,6 @@ def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]
                 )
     for limit in {e.limits["cost"] for e, _ in finals if "cost" in e.limits}:
         axis.axvline(limit, **LIMIT_STYLE)
-
-
-def draw_variations(
-    rows: Sequence[tuple[Any, Mapping[str, Estimate]]], cost_limits: Mapping[str, float], path: Path
-) -> None:
-    """Draw return and costs with their intervals over the values of every row.
-
-    The first row is the environment as trained on; its interval is a band across the panels. Limits
-    are dashed. Without limits, ``cost`` is drawn.
-    """
-    (_, trained), *varied = rows
-    groups: dict[str, list[tuple[str, Mapping[str, Estimate]]]] = {}
-    for (row, value, *_), estimates in varied:
-        label = (row, "others") if value is None else (f"{value}", row)
-        groups.setdefault(label[1], []).append((label[0], estimates))
-    groups = groups or {"others": [("as trained", trained)]}
-    names = ["episode_return", *(f"episode_{key}" for key in cost_limits or ["cost"])]
-    columns = min(len(groups), _MOST_COLUMNS)
-    lines = -(-len(groups) // columns) * len(names)
-    size = (0.8 + _PANEL[0] * columns, 0.5 + _PANEL[1] * lines)
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(lines, columns, squeeze=False)
-    for number, (row, group) in enumerate(groups.items()):
-        band, column = divmod(number, columns)
-        for line, name in enumerate(names):
-            axis, key = panels[band * len(names) + line, column], name.removeprefix("episode_")
-            if number > 0:
-                axis.sharey(panels[line, 0])
-            found = {label: estimates.get(name, _NONE) for label, estimates in group}
-            _draw_values(axis, found, trained[name], f"C{line}")
-            if key in cost_limits:
-                axis.axhline(cost_limits[key], **LIMIT_STYLE)
-            axis.set_title(literal(row) if line == 0 else "")
-            axis.set_ylabel(literal(key) if column == 0 else "")
-    for axis in panels.flat:
-        axis.set_visible(axis.has_data())
-    figure.supxlabel("grey: as trained; dashed: the limit", fontsize="small", color="0.3")
-    save_figure(figure, path)
-
-
-def _draw_values(
-    axis: Axes, values: Mapping[str, Estimate], trained: Estimate, colour: str
-) -> None:
-    axis.axhspan(trained.low, trained.high, color="0.85", zorder=0)
-    axis.axhline(trained.value, color="0.5", linewidth=1, zorder=1)
-    means, low, high = np.array(list(values.values())).T
-    axis.errorbar(range(len(values)), means, (means - low, high - means), fmt="o", color=colour)
-    rotation = 25 if any(len(label) > 5 for label in values) else 0
-    axis.set_xticks(range(len(values)), [literal(label) for label in values], rotation=rotation)
-    axis.set_xlim(-0.6, len(values) - 0.4)
-    set_grid(axis)
-    axis.grid(visible=False, axis="x")
 
 
 def save_panels(figure: Figure, path: Path, formats: Iterable[str]) -> None:

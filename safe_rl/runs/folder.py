@@ -170,5 +170,5 @@ def _remove_unfinished(directory: Path) -> None:
     for path in filter(is_unfinished, paths_below(directory, ".*")):
         with suppress(FileNotFoundError):
             is_old = time.time() - path.stat().st_mtime > _DAY
-            if is_old or not path.name.startswith((".evaluation", ".variations")):
+            if is_old or not path.name.startswith(".evaluation"):
                 path.unlink()

@@ -83,9 +83,9 @@ class Run:
         """The checkpoint of a kind with most steps, readable or not; None if there is none."""
         return next(reversed(self.checkpoints(kind)), None)
 
-    def evaluation_file(self, name: str, suffix: str, kind: str = "evaluation") -> Path:
-        """A file of an evaluation by its suffix, ``json`` or ``mp4``; ``kind``: or variations."""
-        return self.directory / f"{'_'.join(filter(None, (kind, name)))}.{suffix}"
+    def evaluation_file(self, name: str, suffix: str) -> Path:
+        """A file of an evaluation by its suffix, such as ``json`` or ``mp4``."""
+        return self.directory / f"evaluation{name and f'_{name}'}.{suffix}"
 
     def logger_id_file(self, logger: str) -> Path:
         """The file with the id of this run in a logger's service."""

@@ -186,8 +186,6 @@ def test_strange_texts_arrive_as_they_are(text):
 def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, message):
     with pytest.raises(ValueError, match=message):
         run.evaluate(**options)
-    with pytest.raises(ValueError, match=message):
-        run.vary({"few": {"env.hazards_num": 2}}, **options)
 
 
 @pytest.mark.parametrize("choice", [{"env": {"hazards_num": 3}}, {"algo": None}])
@@ -211,8 +209,6 @@ def test_a_run_is_measured_against_other_limits(run):
     share = sum(cost > 0 for cost in costs) / 4
     assert none.estimates["over_limit_cost"].value == share
     assert own.estimates["episode_cost"] == none.estimates["episode_cost"]
-    varied = run.vary({"few": {"env.hazards_num": 2}}, episodes=2, cost_limits={"cost": 0})
-    assert varied.cost_limits["cost"] == 0
 
 
 def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
@@ -221,12 +217,8 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
     assert (run.directory / "certificate.json").is_file()
     with pytest.raises(ValueError, match="made by certify"):
         run.evaluate(certify=True)
-    with pytest.raises(ValueError, match=r"variations by vary"):
-        run.evaluate(variations="dynamics")
     with pytest.raises(ValueError, match=r"episodes=0: a test needs episodes"):
         run.certify(episodes=0)
-    with pytest.raises(ValueError, match=r"variations=\{\}: it must have rows"):
-        run.vary({})
 
 
 def test_a_policy_of_the_package_is_certified_as_a_copy(tmp_path, monkeypatch):

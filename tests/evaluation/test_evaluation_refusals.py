@@ -10,7 +10,6 @@ from safe_rl.cli.evaluate import main
 from safe_rl.cli.report import main as report_main
 from safe_rl.envs import ContractError
 from safe_rl.evaluation.loading import override_env
-from safe_rl.evaluation.variations import Variation, varied
 
 
 @pytest.mark.parametrize(
@@ -19,17 +18,6 @@ from safe_rl.evaluation.variations import Variation, varied
         (["env.hazard_num=3"], "hazards_num"),
         (["checkpoint=there.torchrl"], "checkpoint is last, best, certified or the path"),
         (["env.lidar_num_bins=8", "record=true"], "trained on other observations"),
-        (["variations=sensing", "record=true"], "cannot be combined with video=true"),
-        (["variations=dynamic"], "Did you mean 'dynamics'"),
-        (["variations=nowhere.yaml"], "No such file or directory: 'nowhere.yaml'"),
-        (["variations={}"], "it must have rows"),
-        (["variations=[]"], "it must name at least one"),
-        (["variations={heavy: 2}"], "'heavy: 2' must have keys of the environment"),
-        (["variations={heavy: {algo.name: cpo}}"], "must have keys of the environment"),
-        (["variations={noise: {transforms.sensor_noise: 2}}"], "must have keys of the environment"),
-        (["variations={noise: {transforms.sensor_nois.std: 2}}"], "Did you mean 'sensor_noise'"),
-        (["variations={heavy: {env.mas_scale: 2}}", "episodes=1"], "Did you mean 'mass_scale'"),
-        (["variations={a: {env.mass_scale: [1], env.friction_scale: [2]}}"], "one of them with a"),
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "ending in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
@@ -66,7 +54,6 @@ def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
     [
         ([], ["evaluation.json"]),
         (["picture=there.gif"], ["../there.gif"]),
-        (["variations=sensing"], ["variations.csv", "variations.png"]),
     ],
 )
 def test_what_cannot_be_written_is_said_before_any_episode(
@@ -133,6 +120,3 @@ def test_keys_that_an_environment_of_ones_own_does_not_have_are_refused(run, cap
     error = capsys.readouterr().err
     assert "users.make has no such key. Did you mean 'edge'? The run has edge." in error
     assert override_env(config, {"edge": 0.5})["edge"] == 0.5
-    with pytest.raises(ValueError, match=r"env\.mass_scale: users\.make has no such key"):
-        varied(config, Variation("mass", 2.0, {"env.mass_scale": 2.0}))
-    assert varied(config, Variation("wide", 2.0, {"env.edge": "x2"})).env.edge == 2.0
