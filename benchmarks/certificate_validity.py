@@ -1,15 +1,14 @@
-"""How often both bounds give certificates, and how often these are wrong, in a simulation.
+"""How often the test gives certificates, and how often these are wrong, in a simulation.
 
     python benchmarks/certificate_validity.py --repetitions 500 --means 25 --write FILE.csv
 
 Policies with known mean costs are tested by `safe_rl.scores.certificate.first_certified`, three
 candidates of a run on the same layouts. If the mean is exactly the limit, 25, every certificate is
 wrong, and at most 5 % of the runs may get one. If the mean is below the limit, the share of runs
-with a certificate is the power of the test. Both bounds get the same number of episodes; betting
-may stop earlier. Realistic costs are resampled from `episode_costs.csv` and scaled to the mean.
-This file has 1,000 episodes of the policy `certified/PointGoal1` (`safe-rl evaluate
-certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0). `--costs` names
-another CSV file, with a column per policy and a row per episode.
+with a certificate is the power of the test. Realistic costs are resampled from `episode_costs.csv`
+and scaled to the mean. This file has 1,000 episodes of the policy `certified/PointGoal1`
+(`safe-rl evaluate certified/PointGoal1 episodes=1000 seed=982451653`, commit df5f814, mean 23.0).
+`--costs` names another CSV file, with a column per policy and a row per episode.
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ def distributions(mean: float, own: dict[str, Draw]) -> Iterator[tuple[str, Draw
             yield f"1 in {one_in} costs 1000", with_catastrophes(base, mean, one_in)
 
 
-def is_certified(draw: Draw, bound: str, number: int, rng: np.random.Generator) -> tuple[bool, int]:
+def is_certified(draw: Draw, number: int, rng: np.random.Generator) -> tuple[bool, int]:
     """Whether one of three equal candidates is certified, and on how many episodes in all.
 
     They have the same layouts, and so the same catastrophes. A third of their other episodes have
@@ -98,7 +97,7 @@ def is_certified(draw: Draw, bound: str, number: int, rng: np.random.Generator) 
             used.append(BATCH)
             yield {"cost": costs[start : start + BATCH]}
 
-    claim = Claim({"cost": LIMIT}, highest={"cost": HIGHEST}, bound=bound)
+    claim = Claim({"cost": LIMIT}, highest={"cost": HIGHEST})
     verdict = first_certified(range(TESTS), collect, [claim] * TESTS, TESTS, number)
     return verdict.certified is not None, sum(used)
 
@@ -112,18 +111,14 @@ def main() -> None:
     parser.add_argument("--write", type=Path, help="a CSV file for the table")
     options = parser.parse_args()
     own, rows = measured(options.costs), []
-    print("mean", "costs", "betting", "episodes", "student", "episodes", sep="\t")
+    print("mean", "costs", "certified", "episodes", sep="\t")
     for mean in options.means:
         for name, draw in distributions(mean, own):
+            rng = np.random.default_rng(1)
+            found = [is_certified(draw, options.episodes, rng) for _ in range(options.repetitions)]
             row = {"mean": mean, "costs": name}
-            for bound in ("betting", "student"):
-                rng = np.random.default_rng(1)
-                found = [
-                    is_certified(draw, bound, options.episodes, rng)
-                    for _ in range(options.repetitions)
-                ]
-                row[bound] = round(float(np.mean([certified for certified, _ in found])), 4)
-                row[f"{bound}_episodes"] = int(np.median([used for _, used in found]))
+            row["certified"] = round(float(np.mean([certified for certified, _ in found])), 4)
+            row["episodes"] = int(np.median([used for _, used in found]))
             rows.append(row)
             print(*row.values(), sep="\t", flush=True)
     if options.write:

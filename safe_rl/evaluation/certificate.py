@@ -97,10 +97,6 @@ class Certificate:
                 f"The mean of {key} is that of costs up to {cap}; {name} is the share of episodes "
                 "that cost more."
             )
-        if self.options.bound == "student":
-            sentences.append(
-                "The bound assumes that no rare episodes cost far more than those tested."
-            )
         if not sentences:
             most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
             sentences.append(f"The bound includes rare episodes that cost up to {most}.")

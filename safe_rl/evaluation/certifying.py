@@ -114,7 +114,7 @@ def certify(
     )
     make = make_env or maker_of(directory)
     evaluations = [PolicyEvaluation(config, path, plain, make) for path in candidates]
-    claimed = ("most_over", "bound", "cap", "most_beyond", "tail")
+    claimed = ("most_over", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in claimed})
     number, error = _spend(run, options, candidates)
     claim = replace(claim, level=1 - error)
@@ -321,6 +321,7 @@ def _write(run: Run, certificate: Certificate, candidates: list[int | None]) -> 
     verdict, options, kept = certificate.verdict, certificate.options, certificate.checkpoint
     content = asdict(verdict) | asdict(options)
     content |= {
+        "bound": "betting",  # a file without it is of an earlier version, by Student's bound
         "certified": kept is not None,
         "checkpoint": None if kept is None else kept.name,
         "policy_sha256": None if kept is None else policy_hash(kept),

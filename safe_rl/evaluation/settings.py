@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 from annotated_types import Interval
 from omegaconf import DictConfig, OmegaConf
@@ -84,7 +84,6 @@ class CertificateOptions:
         tests: Largest number of candidates that are tested.
         level: Confidence of a certificate.
         most_over: Share of episodes that may cost more than a limit; 1: no bound on this share.
-        bound: Kind of upper confidence bound of means; betting holds for all costs.
         cap: Cost up to which an episode counts, above all limits; null: all, if costs are bounded.
         most_beyond: Share of episodes that may cost more than the cap.
         tail: Share of the costliest episodes whose mean is limited (CVaR); 1: all episodes.
@@ -96,7 +95,6 @@ class CertificateOptions:
     tests: Annotated[int, Interval(ge=1, le=1000)]
     level: Annotated[float, Interval(gt=0.5, lt=1)]
     most_over: Share
-    bound: Literal["betting", "student"] = "betting"
     cap: PositiveFloat | None = None
     most_beyond: Share = 0.01
     tail: Fraction = 1.0
@@ -127,12 +125,13 @@ def certificate_options(
     With ``risk=chance`` the share of episodes above the limit is certified as well; with
     ``risk=cvar`` the mean cost of the costliest episodes.
     """
-    options = {**config.certificate, "deterministic": False}
+    kinds = get_type_hints(CertificateOptions, include_extras=True)
+    # runs of earlier versions may have further keys
+    options = {name: value for name, value in config.certificate.items() if name in kinds}
     for name, value in (changes or {}).items():
-        if name not in options:
-            raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, options)}")
-        kind = get_type_hints(CertificateOptions, include_extras=True)[name]
-        options[name] = check_value(f"certificate.{name}", kind, value)
+        if name not in kinds:
+            raise ValueError(f"There is no certificate.{name}.{did_you_mean(name, kinds)}")
+        options[name] = check_value(f"certificate.{name}", kinds[name], value)
     if changes and changes.get("episodes") == 0:
         raise SettingError("certificate.episodes=0: a test needs episodes.")
     if not options["episodes"]:  # training was to end without a certificate

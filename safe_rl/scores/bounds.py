@@ -1,4 +1,4 @@
-"""Upper confidence bounds of means, by betting and Student's, and statements about means."""
+"""Upper confidence bounds of means by betting, and statements about means."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from decimal import ROUND_CEILING, Context
 
 import numpy as np
-import scipy  # its parts are loaded on first use, which takes half a second
 from numpy.typing import ArrayLike
 
 # bets, as shares of the largest possible one, and the share of the first wealth for each. An
@@ -98,35 +97,6 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
     return high
 
 
-def student_bound(values: ArrayLike, level: float) -> float:
-    """Student's upper confidence bound of the mean, with a correction for skewness; approximate.
-
-    It is x̄ + (t + γ (1 + 2 t²) / (6 √n)) s / √n, with Student's quantile t. γ is twice the
-    sample's skewness, or 0 if that is negative (Chen, "Testing the mean of skewed distributions",
-    1995). The bound is too low if high values are so rare that the sample has none.
-
-    Args:
-        values: Independent values, [n].
-        level: Confidence, in (0.5, 1).
-
-    Returns:
-        The bound; infinite for fewer than two values, and if all are equal or one is not finite.
-
-    Examples:
-        >>> round(student_bound([20.0, 22.0, 24.0, 26.0], level=0.95), 2)
-        26.04
-    """
-    values = np.asarray(values, dtype=float)
-    number = len(values)
-    if number < 2 or not np.isfinite(values).all() or values.min() == values.max():
-        return math.inf
-    mean, spread = values.mean(), values.std(ddof=1)
-    skewness = ((values - mean) ** 3).mean() / spread**3
-    quantile = float(scipy.stats.t.ppf(level, number - 1))
-    correction = 2 * max(0.0, skewness) * (1 + 2 * quantile**2) / (6 * math.sqrt(number))
-    return float(mean + (quantile + correction) * spread / math.sqrt(number))
-
-
 @dataclass(frozen=True)
 class Statement:
     """The statement that the mean over episodes of a value, such as the cost, is at most a limit.
@@ -136,14 +106,12 @@ class Statement:
         limit: Limit of the mean.
         highest: The largest possible value.
         values: Value of every episode, [E].
-        is_share: Whether values are 0 or 1.
     """
 
     name: str
     limit: float
     highest: float
     values: np.ndarray
-    is_share: bool = False
 
     @property
     def is_by_construction(self) -> bool:
@@ -165,23 +133,14 @@ class Statement:
                 return int(np.argmax(is_shown)) + 1
         return math.inf
 
-    def bound(self, level: float, kind: str) -> float:
-        """Upper confidence bound of the mean; `kind` is "betting" or "student"."""
-        if kind == "student" and self.is_share:
-            # exact (Clopper and Pearson 1934)
-            over = int(self.values.sum())
-            test = scipy.stats.binomtest(over, len(self.values), alternative="less")
-            return float(test.proportion_ci(level, method="exact").high)
-        if kind == "student":
-            # a cost that is infinite or NaN has no bound
-            most = float(np.max(self.values, initial=self.highest))
-            return min(student_bound(self.values, level), most)
+    def bound(self, level: float) -> float:
+        """Upper confidence bound of the mean."""
         return betting_bound(self.values, level, self.highest)
 
     def is_shown(self, level: float) -> bool:
-        """Whether the betting bound is within the limit, without computing it."""
+        """Whether the bound is within the limit, without computing it."""
         if self.is_by_construction or not np.isfinite(self.values).all():
-            return self.bound(level, "betting") <= self.limit
+            return self.bound(level) <= self.limit
         return bool(log_wealth(self.values, self.limit, self.highest)[-1] >= -math.log(1 - level))
 
     def is_hopeless(self, level: float, most: int) -> bool:

@@ -47,11 +47,9 @@ class Claim:
         most_over: Largest share of episodes that may cost more than d; 1: no bound.
         level: Confidence of the whole statement.
         highest: Cost key -> the highest possible cost of an episode; infinite if not given.
-        bound: Kind of the bounds of means: "betting", which always holds, or "student", for costs
-            without rare high ones.
         cap: Costs of episodes count only up to this value, above all limits, and at most a share
-            ``most_beyond`` of them may cost more. None: no cap, or, for the betting bound if the
-            highest cost is infinite, a cap of ten times the limit (of 10 for a limit of 0).
+            ``most_beyond`` of them may cost more. None: no cap, or, if the highest cost is
+            infinite, a cap of ten times the limit (of 10 for a limit of 0).
         most_beyond: Largest share of episodes that may cost more than a cap.
         tail: Share α of the episodes with the highest costs, whose mean is limited (CVaR); 1: the
             mean of all episodes is limited.
@@ -72,7 +70,6 @@ class Claim:
     most_over: float = 1.0
     level: float = 0.95
     highest: Mapping[str, float] = field(default_factory=dict)
-    bound: str = "betting"
     cap: float | None = None
     most_beyond: float = 0.01
     tail: float = 1.0
@@ -98,15 +95,12 @@ class Claim:
 
     def _about(self, key: str, costs: np.ndarray) -> Iterator[Statement]:
         limit, highest = self.limits[key], self.highest.get(key, math.inf)
-        needs_cap = math.isinf(highest) and self.bound == "betting"
         # with a cap of 0, every policy would keep a limit of 0
-        cap = 10 * (limit or 1.0) if self.cap is None and needs_cap else self.cap
+        cap = 10 * (limit or 1.0) if self.cap is None and math.isinf(highest) else self.cap
         capped = costs
         if cap is not None and cap < highest:
             capped, highest = np.where(np.isnan(costs), costs, costs.clip(max=cap)), cap
-            yield Statement(
-                f"beyond_{cap:g}_{key}", self.most_beyond, 1.0, _above(costs, cap), True
-            )
+            yield Statement(f"beyond_{cap:g}_{key}", self.most_beyond, 1.0, _above(costs, cap))
         if self.tail < 1:
             start = self.thresholds[key]
             excess = start + (capped - start).clip(0) / self.tail
@@ -115,7 +109,7 @@ class Claim:
         else:
             yield Statement(f"mean_{key}", limit, highest, capped)
         if self.most_over < 1:
-            yield Statement(f"over_limit_{key}", self.most_over, 1.0, _above(costs, limit), True)
+            yield Statement(f"over_limit_{key}", self.most_over, 1.0, _above(costs, limit))
 
     def bounds(self, costs: Costs, tests: int) -> dict[str, tuple[float, float]]:
         """Every upper confidence bound and its limit, by name.
@@ -128,19 +122,14 @@ class Claim:
             tests: Largest number of policies tested; they share the error (Bonferroni).
         """
         level = self._level(tests)
-        return {s.name: (s.bound(level, self.bound), s.limit) for s in self.statements(costs)}
+        return {s.name: (s.bound(level), s.limit) for s in self.statements(costs)}
 
     def shortfalls(self, costs: Costs, tests: int) -> dict[str, float]:
         """By how much bounds exceed their limits; empty if the claim is certified."""
         return _shortfalls(self.bounds(costs, tests))
 
     def fewest(self, tests: int) -> float:
-        """Number of episodes below which no test can succeed, even if no episode costs anything.
-
-        With Student's bound it is not known, and 2.
-        """
-        if self.bound != "betting":
-            return 2
+        """Number of episodes below which no test can succeed, even if no episode costs anything."""
         level = self._level(tests)
         nothing = {key: np.zeros(1) for key in self.limits}
         return max((statement.fewest(level) for statement in self.statements(nothing)), default=1)
@@ -148,11 +137,8 @@ class Claim:
     def may_end(self, costs: Costs, tests: int, most: int) -> bool:
         """Whether a test of up to ``most`` episodes may end early.
 
-        It may if betting has shown all statements, or if the test will probably fail. A test with
-        Student's bound may not, because this bound may be computed only once, after all episodes.
+        It may if all statements have been shown, or if the test will probably fail.
         """
-        if self.bound != "betting":
-            return False
         level, statements = self._level(tests), self.statements(costs)
         if all(statement.is_shown(level) for statement in statements):
             return True
@@ -239,8 +225,7 @@ def first_certified(
 ) -> Verdict:
     """Test candidates in order on fresh episodes until one is certified.
 
-    With the betting bound a test ends as soon as its bounds are within the limits, or when it will
-    probably fail. Student's bound may be computed only once, after all episodes.
+    A test ends as soon as its bounds are within the limits, or when it will probably fail.
 
     Args:
         order: Numbers of the candidates, from `rank`.

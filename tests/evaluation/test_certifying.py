@@ -64,9 +64,8 @@ def test_a_policy_that_keeps_its_limit_is_certified_and_kept(train):
     assert "The bound includes rare episodes that cost up to 20." in str(certificate)
     torch.rand(3)
     assert certify(directory, OPTIONS, make_env=make_env) == certificate
-    student = certify(directory, replace(OPTIONS, bound="student"), make_env=make_env)
-    assert "assumes that no rare episodes cost far more" in str(student)
-    assert "test 2 of this run; the level is that of all its tests" in str(student)
+    second = certify(directory, replace(OPTIONS, episodes=130), make_env=make_env)
+    assert "test 2 of this run; the level is that of all its tests" in str(second)
 
 
 def test_a_certificate_is_about_the_policy_beside_it_whenever_it_is_interrupted(train, monkeypatch):

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from safe_rl.scores.bounds import betting_bound, log_wealth, student_bound
+from safe_rl.scores.bounds import betting_bound, log_wealth
 
 LEVEL = 0.95
 RNG = np.random.default_rng(1)
@@ -60,27 +59,9 @@ def test_the_bound_of_rare_events_is_little_above_the_exact_one():
 @pytest.mark.parametrize(("odd", "highest"), [(np.nan, 50.0), (np.inf, 50.0), (51.0, 50.0)])
 def test_values_that_cannot_be_have_no_bound(odd, highest):
     assert betting_bound([1.0] * 99 + [odd], LEVEL, highest) == np.inf
-    assert student_bound([1.0, 2.0, odd if odd != 51 else np.nan], LEVEL) == np.inf
 
 
 def test_a_highest_value_has_to_be_known():
     with pytest.raises(ValueError, match="must be finite"):
         betting_bound([1.0], LEVEL, np.inf)
     assert betting_bound([], LEVEL, 3.0) == betting_bound([3.0, 3.0], LEVEL, 3.0) == 3.0
-
-
-@pytest.mark.parametrize("name", ["poisson", "geometric", "even"])
-def test_students_bound_keeps_its_level_where_high_costs_are_not_rare(name):
-    draw, mean, _ = DISTRIBUTIONS[name]
-    wrong = np.mean([student_bound(draw(100), LEVEL) < mean for _ in range(1000)])
-    assert wrong < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 1000)
-
-
-def test_students_correction_is_for_skewed_costs_only():
-    # even, with a tail to the left, with one to the right
-    costs = np.array([[10.0, 20.0, 30.0, 40.0], [0.0, 100.0, 100.0, 100.0], [0.0, 0.0, 0.0, 100.0]])
-    student = costs.mean(1) + stats.t.ppf(LEVEL, 3) * costs.std(1, ddof=1) / 2
-    bounds = [student_bound(row, LEVEL) for row in costs]
-    assert bounds[:2] == pytest.approx(student[:2])
-    assert bounds[2] > student[2]
-    assert student_bound([4.0] * 30, LEVEL) == np.inf
