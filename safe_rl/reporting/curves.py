@@ -185,19 +185,9 @@ def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
 
 
 def _curves(runs: Sequence[Run], key: str) -> list[Average | None]:
-    """Return, episode cost and cost rate; without an episode the first two per 1,000 steps."""
+    """Return, episode cost and cost rate; None in place of those without a value."""
     columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
-    if are_short(runs):
-        columns[:2] = [("reward_rate", False), (f"{key}_rate", False)]
-    found = [average(runs, name, smooth=s) for name, s in columns]
-    if are_short(runs):
-        found[:2] = [c and Average(c.steps, *(1000 * v for v in c[1:])) for c in found[:2]]
-    return found
-
-
-def are_short(runs: Sequence[Run]) -> bool:
-    """Whether no episode of these runs has ended."""
-    return not any(run.column("episode_return").size for run in runs)
+    return [average(runs, name, smooth=s) for name, s in columns]
 
 
 def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
@@ -205,7 +195,7 @@ def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
     return [
         {
             **{"environment": e.environment, "algorithm": e.algorithm, "cost": key},
-            **{"quantity": name, "per_1000_steps": are_short(runs), "seeds": len(runs)},
+            **{"quantity": name, "seeds": len(runs)},
             **dict(zip(Average._fields, map(float, point), strict=True)),
         }
         for e in experiments
@@ -227,7 +217,6 @@ def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], styl
     unfinished = [[run] for run in experiment.runs if not run.is_finished]
     looks += [(runs, f"{name} (unfinished)", ":", 1.2) for runs in unfinished]
     for runs, label, line, width in looks:
-        label += " (per 1,000 steps)" if are_short(runs) else ""
         for axis, curve in zip(axes, _curves(runs, key), strict=True):
             if curve is None:
                 continue

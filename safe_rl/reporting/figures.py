@@ -1,4 +1,4 @@
-"""Pictures of final scores; styles, legends and files of all pictures."""
+"""Pictures of final scores; styles and legends of all pictures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
-from pathlib import Path
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -17,7 +16,6 @@ from matplotlib.figure import Figure
 
 from safe_rl.reporting.experiments import PACKAGED, Experiment
 from safe_rl.reporting.tables import Record, short_number
-from safe_rl.runs.curves import save_figure
 from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.comparisons import pareto_front
 
@@ -176,21 +174,3 @@ def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]
                 )
     for limit in {e.limits["cost"] for e, _ in finals if "cost" in e.limits}:
         axis.axvline(limit, **LIMIT_STYLE)
-
-
-def save_panels(figure: Figure, path: Path, formats: Iterable[str]) -> None:
-    """Write every panel of a figure to a file of its own, and the legend, if it has one.
-
-    Args:
-        figure: The figure.
-        path: Stem of the files: ``curves`` becomes ``curves_1.pdf``, ``curves_legend.pdf``.
-        formats: Suffixes of the files.
-    """
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw(renderer)
-    parts: dict[str, Any] = {f"{n}": axis for n, axis in enumerate(figure.axes, 1) if axis.axison}
-    parts |= dict(zip(["legend"], figure.legends, strict=False))
-    for name, part in parts.items():
-        box = part.get_tightbbox(renderer).transformed(figure.dpi_scale_trans.inverted())
-        for form in formats:
-            save_figure(figure, path.with_name(f"{path.name}_{name}.{form}"), box.padded(0.04))

@@ -21,7 +21,6 @@ from pydantic import PositiveInt
 from safe_rl.checks import CheckedOptions, option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
-from safe_rl.naming import did_you_mean
 from safe_rl.reporting import figures, scoring, slates
 from safe_rl.reporting.archive import Run, find_runs
 from safe_rl.reporting.curves import (
@@ -63,9 +62,7 @@ class ReportOptions(CheckedOptions):
     title: str | None = option(None, "heading; null: the folder's name")
     formats: Annotated[str, _FORMATS] = option("png", "of the pictures, such as png,svg,pdf")
     width: Annotated[float, Interval(ge=2, le=40)] = option(figures.WIDTH, "of the pictures [inch]")
-    panels: bool = option(False, "write every panel of a picture to a file of its own, too")
     labels: dict[str, str] = option(dict, "names to show, such as \"{cpo: 'CPO (ours)'}\"")
-    columns: str | None = option(None, "columns of tables.tex, such as algorithm,J_r,J_c")
 
 
 def listed(text: str | None) -> list[str]:
@@ -258,19 +255,12 @@ def write_report(report: Report, out: Path, title: str, options: ReportOptions) 
 
     Raises:
         ModuleNotFoundError: If Jinja is missing; the message names the extra.
-        ValueError: If no table has one of the columns that ``options.columns`` names.
     """
     jinja2 = import_extra("jinja2", "report")
-    columns = listed(options.columns)
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
-    known = dict.fromkeys(title for table in tables for title in table.plain_titles)
-    for name in columns:
-        if name not in known:
-            hint = did_you_mean(name, known) or f" They have {', '.join(known)}."
-            raise ValueError(f"columns={name}: no table has this column.{hint}")
     out.mkdir(parents=True, exist_ok=True)
     place = _places(out)
-    replace_text(out / "tables.tex", "\n".join(table.latex(columns) for table in tables))
+    replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
     curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
     curves.write_csv(out / "curves.csv")
     environment = jinja2.Environment(
@@ -314,8 +304,6 @@ def _write(block: Block, place: Callable[[str], Path], options: ReportOptions) -
     path, formats = place(block.name), listed(options.formats)
     for form in {*formats, "png"}:  # the page needs PNG
         save_figure(block.figure, path.with_suffix(f".{form}"))
-    if options.panels:
-        figures.save_panels(block.figure, path, formats)
     return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
 
 

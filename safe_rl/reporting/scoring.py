@@ -33,21 +33,9 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
         **_over_seeds([run.figures(list(cost_keys)) | _critic_bias(run) for run in runs]),
         **{f"limit_{key}": limit for key, limit in limits.items()},
         **excesses,
-        **({} if any(map(has_episodes, runs)) else _over_seeds([_rates(r) for r in runs])),
         "satisfies": all(excess <= 0 for excess in excesses.values()),
         **_published(experiment),
     }
-
-
-def has_episodes(run: Run) -> bool:
-    """Whether an episode of it has ended."""
-    return bool(run.column("episode_return").size)
-
-
-def _rates(run: Run) -> dict[str, float]:
-    """Return and cost per 1,000 steps of all training, for runs in which no episode has ended."""
-    names = {"return_per_1000": "reward_rate", "cost_per_1000": "cost_rate"}
-    return {k: 1000 * run.table[v][-1] for k, v in names.items() if v in run.table}
 
 
 def _critic_bias(run: Run) -> dict[str, float]:
@@ -102,10 +90,6 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         "steps": "{fewest_steps:,}| to {most_steps:,}",
         **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
-    short = [e for e in experiments if not any(map(has_episodes, e.finished))]
-    if short:
-        columns["return per 1,000 steps"] = spread("return_per_1000", 2)
-        columns["cost per 1,000 steps"] = spread("cost_per_1000", 1)
     if "paper_episode_return" in has:
         steps = benchmark.PUBLISHED_STEPS[str(experiments[0].benchmark)]
         title = f"paper, {steps / 1e6:g}M steps"
@@ -114,24 +98,7 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         title = f"later work, {benchmark.REIMPLEMENTATION_STEPS / 1e6:g}M steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
     marks = _final_marks(records, {e.algorithm: (e.lengths, e.limits) for e in experiments})
-    note = _on_short_runs(short)
-    return Table(f"final_{environment}", environment, columns, records, note, rows, marks)
-
-
-def _on_short_runs(experiments: Sequence[Experiment]) -> str:
-    """A note on experiments in which no episode has ended, and what to set; "" if there is none."""
-    if not experiments:
-        return ""
-    names = ", ".join(e.algorithm for e in experiments)
-    note = f"No episode of {names} has ended, so there are rates per 1,000 steps instead. "
-    first = experiments[0].runs[0]
-    envs, length = first.settings.get("num_envs"), first.episode_length
-    if isinstance(envs, int) and length:
-        note += (
-            f"Episodes have {length:,} steps and there were {envs} environments: the first end "
-            f"after {envs * length:,} steps (frames=…), earlier with fewer of them (num_envs=…)."
-        )
-    return note
+    return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
 
 
 def _final_marks(

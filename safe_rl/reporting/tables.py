@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -133,11 +132,6 @@ class Table:
         """Whether each column has numbers: then the first field of its template has a format."""
         return [":" in template.partition("}")[0] for template in self.columns.values()]
 
-    @property
-    def plain_titles(self) -> list[str]:
-        """Titles of the columns, without ``$`` and backslashes."""
-        return [re.sub(r"[$\\]", "", title) for title in self.columns]
-
     def rows(self) -> list[list[Cell]]:
         """The entries that the page shows."""
         return [
@@ -148,19 +142,12 @@ class Table:
             for row in (self.records if self.shown is None else self.shown)
         ]
 
-    def latex(self, columns: Sequence[str] = ()) -> str:
-        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit.
-
-        Args:
-            columns: Plain titles of the columns to write; empty: all.
-        """
+    def latex(self) -> str:
+        """The table in LaTeX, for the package booktabs; a triangle marks costs over their limit."""
         looks = {"best": r"\textbf{{{}}}", "bad": r"{} $\triangle$", "": "{}"}
         cells = [[looks[c.mark].format(c.text.translate(_LATEX)) for c in r] for r in self.rows()]
         frame = import_extra("pandas", "report").DataFrame(cells, columns=list(self.columns))
-        titles = enumerate(self.plain_titles)
-        kept = [place for place, title in titles if not columns or title in columns]
-        frame = frame.iloc[:, kept]
-        sides = "".join("r" if self.numbers[place] else "l" for place in kept)
+        sides = "".join("r" if is_number else "l" for is_number in self.numbers)
         text: str = frame.to_latex(index=False, escape=False, column_format=sides)
         return f"% {clean(self.title)}\n{text}"
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import EngFormatter
-from matplotlib.transforms import Bbox, ScaledTranslation
+from matplotlib.transforms import ScaledTranslation
 
 from safe_rl.files import replacing
 from safe_rl.runs.table import final_width
@@ -30,12 +30,12 @@ class NotebookFigure(Figure):
         return picture.getvalue()
 
 
-def save_figure(figure: Figure, path: Path, part: Bbox | None = None) -> Path:
-    """Write a figure, or a part of it [inch], as PNG, SVG or PDF by the suffix; return the path."""
+def save_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, SVG or PDF by the suffix; return the path."""
     # a viewer that watches the file never shows an incomplete picture; publishers refuse fonts of
     # type 3, Matplotlib's default
     with replacing(path) as unfinished, rc_context({"pdf.fonttype": 42}):
-        figure.savefig(unfinished, dpi=120, bbox_inches=part)
+        figure.savefig(unfinished, dpi=120)
     return path
 
 

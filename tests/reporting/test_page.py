@@ -263,20 +263,12 @@ def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_ar
     assert list(read_archive(kept)) == ["PointGoal1/cpo/seed0"]
 
 
-def test_pictures_and_tables_for_papers(tmp_path, capsys):
+def test_pictures_and_tables_for_papers(tmp_path):
     for algo in ("cpo", "ppo"):
         write_run(tmp_path, algo=algo, returns=(1.0, 2.0), costs=(3, 4), rates=(0.1, 0.1))
-    words = ["panels=true", "width=4", "formats=pdf", "columns=algorithm,J_r"]
-    assert main([str(tmp_path), *words[:-1], "columns=algorithm,J_R"]) == 1
-    assert "columns=J_R: no table has this column. Did you mean 'J_r'?" in capsys.readouterr().err
     out = tmp_path / "report"
-    assert not out.exists()
-    assert main([str(tmp_path), *words]) == 0
-    parts = {path.name for path in out.glob("curves_*.pdf")}
-    assert parts == {"curves_1.pdf", "curves_2.pdf", "curves_3.pdf", "curves_legend.pdf"}
+    assert main([str(tmp_path), "width=4", "formats=pdf"]) == 0
     assert b"/Type3" not in (out / "curves.pdf").read_bytes()
-    first = (out / "tables.tex").read_text().split("midrule")[0]
-    assert "algorithm & $J_r$ \\\\" in first
     curves = pandas.read_csv(out / "curves.csv")
     cost = curves[(curves.algorithm == "CPO") & (curves.quantity == "cost")]
     assert cost[["steps", "mean"]].to_numpy().tolist() == [[1000.0, 3.0], [2000.0, 3.5]]

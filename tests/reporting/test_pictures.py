@@ -41,7 +41,7 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
     assert panels[2, 0].lines[0].get_linestyle() == ":"
     # where no episode has ended, the cost rate alone gives the name and the steps
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert names == ["PPO", "TRPO (per 1,000 steps)", "CPO (unfinished)"]
+    assert names == ["PPO", "TRPO", "CPO (unfinished)"]
     assert panels[1, 0].get_xlim() == panels[1, 2].get_xlim()
 
 

@@ -257,19 +257,3 @@ def test_the_papers_tables_have_what_there_is_beside_the_published_values(tmp_pa
     assert {part[f"paper {name}"] for name in figures} == {"—"}
     assert (cpo["environments"], cpo["dominated by"]) == ("1 of 6", "TRPO-Lagrangian")
     assert (trpo["dominated by"], ppo["dominated by"]) == ("", "")
-
-
-def test_runs_in_which_no_episode_ended_have_rates_and_say_what_they_need(tmp_path):
-    nan = float("nan")
-    rows = {"returns": [nan, nan], "costs": [nan, nan], "rates": [0.05, 0.04]}
-    columns = {"reward_rate": [0.002, 0.003]}
-    write_run(tmp_path, algo="cpo", **rows, columns=columns, num_envs=100)
-    (experiment,) = experiments_in(tmp_path)
-    table = final_table([experiment])
-    (row,) = texts_of(table)
-    assert (row["$J_r$"], row["return per 1,000 steps"]) == ("—", "3.00")
-    assert row["cost per 1,000 steps"] == "40.0"
-    assert "No episode of CPO has ended" in table.note
-    assert "100 environments: the first end after 100,000 steps" in table.note
-    write_run(tmp_path, algo="ppo")
-    assert not final_table([e for e in experiments_in(tmp_path) if e.base == "ppo"]).note
