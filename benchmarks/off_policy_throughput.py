@@ -85,7 +85,7 @@ def ours(args: argparse.Namespace) -> Callable[[], None]:
     )
     memory = Memory(
         capacity=20_000, batch_size=args.batch_size, in_keys=loss.in_keys,
-        gammas={"reward": 0.99, "cost": 0.99}, n_steps=1, keep=False,
+        summed=["reward", "cost"], gamma=0.99, n_steps=1, keep=False,
     )  # fmt: skip
     steps = random_steps(50, 400, args.observation_size)
     memory.extend(steps)

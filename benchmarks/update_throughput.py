@@ -122,13 +122,8 @@ def main() -> None:
             actor, batch, args.observation_size, args.minibatch_size
         )
     }
-    for fraction in (1.0, 0.1):
-        step = {"fisher_subsample": fraction, **TRUST_REGION}
-        name = "" if fraction == 1.0 else f", fisher_subsample={fraction}"
-        updates[f"TRPO step{name}"] = functools.partial(TRPOStep(trpo, **step), batch, limits)
-        updates[f"CPO step{name}"] = functools.partial(
-            CPOStep(cpo, rescale_violation=True, **step), batch, limits
-        )
+    for step in (TRPOStep(trpo, **TRUST_REGION), CPOStep(cpo, **TRUST_REGION)):
+        updates[type(step).__name__] = functools.partial(step, batch, limits)
     print(f"{args.samples} samples, observation size {args.observation_size}, {HIDDEN}, "
           f"{args.threads} threads; median of {args.repeats}")  # fmt: skip
     for name, update in updates.items():

@@ -134,7 +134,6 @@ def cpo_trainer(
     policy_loss = CPOLoss(parts.actor, entropy_coeff=0.0)
     step = CPOStep(
         policy_loss,
-        rescale_violation=True,
         target_kl=0.01,
         damping=0.1,
         cg_iterations=10,

@@ -33,8 +33,6 @@ class CPOStep(TRPOStep):
     Args:
         loss: A `CPOLoss`, or a callable of your own that returns a TensorDict with scalars
             ``loss_…`` and the differentiable ``cost_surrogate``, [k].
-        rescale_violation: Whether to divide the violations by the episode length: b is the gradient
-            of an average per time step, so c has to be one too.
         largest_required_decrease: Upper bound of every c, as a share of √(2δ bᵀH⁻¹b), which is the
             largest decrease of the surrogate within the trust region; None: no bound. Without it, a
             policy far above its limit takes recovery steps (case 0), which ignore the reward, until
@@ -51,8 +49,8 @@ class CPOStep(TRPOStep):
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> settings = {"rescale_violation": True, "damping": 0.1, **search}
-        >>> step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
+        >>> settings = {"target_kl": 0.01, "damping": 0.1, **search}
+        >>> step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), **settings)
         >>> state = LimitState.of(cost=[0.0], limit=[25.0], length=50.0)
         >>> step(batch, state)["case"]
         tensor(3)
@@ -62,12 +60,10 @@ class CPOStep(TRPOStep):
         self,
         loss: Loss,
         *,
-        rescale_violation: bool,
         largest_required_decrease: PositiveFloat | None = None,
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        self.rescale_violation = rescale_violation
         self.largest_required_decrease = largest_required_decrease
 
     def _propose(
@@ -111,9 +107,8 @@ class CPOStep(TRPOStep):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
         surrogates = losses["cost_surrogate"]
-        c = limits.required_decrease_for(surrogates)
-        if self.rescale_violation:
-            c = c / limits.length_for(surrogates)
+        # b is the gradient of an average per time step, so c has to be one too
+        c = limits.required_decrease_for(surrogates) / limits.length_for(surrogates)
         g = flat_gradient(finite_sum(losses), self.parameters, retain_graph=True)
         return g, self._gradients(surrogates), c
 
@@ -199,7 +194,7 @@ class PCPOStep(CPOStep):
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> settings = {"projection": "kl", "rescale_violation": True, "damping": 0.1, **search}
+        >>> settings = {"projection": "kl", "damping": 0.1, **search}
         >>> step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
         >>> metrics = step(batch, LimitState.of(cost=[0.0], limit=[1e6], length=50.0))
         >>> metrics["nu"]  # far inside, TRPO's step

@@ -102,13 +102,11 @@ class OffPolicy(Resumable, Algorithm):
         )
         update = instantiate(config.policy_update, loss=loss)
         _check_loss(config, constraints, loss)
-        gammas = dict.fromkeys(["reward", *constraints.keys], config.loss.get("gamma", 1.0))
-        if (cost_gamma := config.loss.get("cost_gamma")) is not None:
-            gammas |= dict.fromkeys(constraints.keys, cost_gamma)
         buffer = instantiate(
             config.memory,
             in_keys=loss.in_keys,
-            gammas=gammas,
+            summed=["reward", *constraints.keys],
+            gamma=config.loss.get("gamma", 1.0),
             device=device,
             example=env.fake_tensordict(),
         )

@@ -36,7 +36,8 @@ class Memory(Checked):
         capacity: Largest number of transitions; the oldest are overwritten first.
         batch_size: Transitions in a minibatch.
         in_keys: Entries of a step that are stored.
-        gammas: Entry below ``next`` that is summed over n steps -> discount per step.
+        summed: Entries below ``next`` that are summed over n steps.
+        gamma: Discount per step of these sums.
         n_steps: Number n of steps that a transition spans (n-step returns).
         keep: Whether checkpoints have the transitions, so that a resumed run continues exactly.
         device: Device of the minibatches.
@@ -49,7 +50,7 @@ class Memory(Checked):
     Examples:
         >>> memory = Memory(
         ...     capacity=100, batch_size=4, in_keys=["observation", ("next", "reward")],
-        ...     gammas={"reward": 0.99}, n_steps=1, keep=True,
+        ...     summed=["reward"], gamma=0.99, n_steps=1, keep=True,
         ... )
         >>> step = {"reward": torch.ones(2, 5, 1), "done": torch.zeros(2, 5, 1, dtype=torch.bool)}
         >>> batch = TensorDict(observation=torch.zeros(2, 5, 3), next=step, batch_size=[2, 5])
@@ -64,7 +65,8 @@ class Memory(Checked):
         capacity: Annotated[int, Interval(ge=1, le=10**8)],
         batch_size: PositiveInt,
         in_keys: Sequence[NestedKey],
-        gammas: Mapping[NestedKey, float],
+        summed: Sequence[NestedKey],
+        gamma: float,
         n_steps: Annotated[int, Interval(ge=1, le=1000)],
         keep: bool,
         device: torch.device | str | None = None,
@@ -75,17 +77,13 @@ class Memory(Checked):
         self.in_keys, self._device = list(in_keys), torch.device(device or "cpu")
         storage = LazyTensorStorage(capacity, device=self._device)
         self._buffer = TensorDictReplayBuffer(storage=storage)
-        keys_of: dict[float, list[NestedKey]] = {}
-        for key, gamma in gammas.items() if n_steps > 1 else ():
-            keys_of.setdefault(gamma, []).append(key)
-        # its default done_keys keep `terminated` of the first step, so that values would be
-        # bootstrapped beyond an end within the n steps
-        self._n_step_transforms = [
-            MultiStepTransform(n_steps, gamma, reward_keys=keys, done_keys=[])
-            for gamma, keys in keys_of.items()
-        ]
+        self._sums: MultiStepTransform | None = None
+        if n_steps > 1:
+            # its default done_keys keep `terminated` of the first step, so that values would be
+            # bootstrapped beyond an end within the n steps
+            self._sums = MultiStepTransform(n_steps, gamma, reward_keys=list(summed), done_keys=[])
         self._open_ids: Tensor | None = None  # of the last steps' trajectories; -1: it has ended
-        self._spanned = ["steps_to_next_obs"] if self._n_step_transforms else []
+        self._spanned = ["steps_to_next_obs"] if n_steps > 1 else []
 
     def __len__(self) -> int:
         """Number of transitions in the buffer."""
@@ -96,7 +94,7 @@ class Memory(Checked):
 
         Where a collector's ``traj_ids`` say that they do not, sums over n steps end, too.
         """
-        if not self._n_step_transforms:
+        if self._sums is None:
             self._add([batch])
             return
         wanted = batch.select(*{("next", "done"), *self.in_keys})
@@ -105,7 +103,8 @@ class Memory(Checked):
             if last is not None and ((last != ids[..., 0]) & (last >= 0)).any():
                 self.end_rows()
             self._open_ids = ids[..., -1].masked_fill(wanted["next", "done"][..., -1, 0], -1)
-        self._add([self._over_steps(piece) for piece in wanted.split(_LONGEST_ROW, -1)])
+        # the transform remembers the steps whose sums are not complete
+        self._add([self._sums.inv(piece) for piece in wanted.split(_LONGEST_ROW, -1)])
 
     def _add(self, given: list[TensorDictBase | None]) -> None:
         pieces = [
@@ -115,36 +114,16 @@ class Memory(Checked):
             steps = pieces[0] if len(pieces) == 1 else torch.cat(pieces, -1)
             self._buffer.extend(steps.reshape(-1))
 
-    def _over_steps(self, piece: TensorDictBase) -> TensorDictBase | None:
-        """Transitions over n steps; None if there are fewer than n steps so far.
-
-        The transforms remember the steps whose sums are not complete.
-        """
-        first, *others = self._n_step_transforms
-        transitions: TensorDictBase | None = first.inv(piece)
-        for transform in others:
-            sums = transform.inv(piece.select(*_read_by(transform)))
-            if transitions is not None:
-                transitions["next"].update(sums["next"].select(*transform.reward_keys))
-        return transitions
-
     def end_rows(self) -> None:
         """Complete the sums over n steps, because the next batch does not follow the last one."""
         # TorchRL has no public access to the steps whose sums are not complete
-        if not self._n_step_transforms or self._n_step_transforms[0]._buffer is None:
+        if self._sums is None or self._sums._buffer is None:
             return
-        waiting = self._n_step_transforms[0]._buffer.clone()
+        self._sums._buffer = waiting = self._sums._buffer.clone()
         waiting["next", "done"][..., -1, :] = True
-        self._set_waiting(waiting)
-        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._n_step_transforms[0].n_steps)
-        self._add([self._over_steps(beyond)])
-        self._set_waiting(None)
-
-    def _set_waiting(self, steps: TensorDictBase | None) -> None:
-        """Set the last steps, whose sums are not complete."""
-        for number, transform in enumerate(self._n_step_transforms):
-            kept = steps if steps is None or not number else steps.select(*_read_by(transform))
-            transform._buffer = kept
+        beyond = waiting[..., -1:].expand(*waiting.shape[:-1], self._sums.n_steps)
+        self._add([self._sums.inv(beyond)])
+        self._sums._buffer = None
 
     def minibatches(self, number: int) -> Iterator[TensorDictBase]:
         """Draw a number of minibatches, several at once, which takes a tenth of the time."""
@@ -163,8 +142,7 @@ class Memory(Checked):
             # of a view, torch would save the whole underlying storage
             steps = steps if size == self.capacity else steps.clone()
             state["steps"] = {key: v.as_subclass(torch.Tensor) for key, v in steps.items()}
-        tail = self._n_step_transforms[0]._buffer if self._n_step_transforms else None
-        if tail is not None:
+        if self._sums is not None and (tail := self._sums._buffer) is not None:
             state["tail"] = tail.clone().flatten_keys("/").to_dict()
             state["tail_shape"] = list(tail.batch_size)
         return state
@@ -182,11 +160,12 @@ class Memory(Checked):
         if size:
             self._buffer.extend(self._restored(state_dict["steps"], [size], self._spanned))
         self._buffer.writer.load_state_dict(writer)
-        self._set_waiting(None)
         self._open_ids = None
-        if self._n_step_transforms and "tail" in state_dict:
-            tail, shape = state_dict["tail"], state_dict["tail_shape"]
-            self._set_waiting(self._restored(tail, shape, [("next", "done")]))
+        if self._sums is not None:
+            self._sums._buffer = None
+            if "tail" in state_dict:
+                tail, shape = state_dict["tail"], state_dict["tail_shape"]
+                self._sums._buffer = self._restored(tail, shape, [("next", "done")])
 
     def _restored(
         self, entries: Mapping[str, Tensor], shape: list[int], further: Sequence[NestedKey]
@@ -207,8 +186,3 @@ class Memory(Checked):
         # the saved run may have used another device
         steps = TensorDict(entries, shape, device=self._device).unflatten_keys("/")
         return steps.select(*dict.fromkeys([*self.in_keys, *further]))
-
-
-def _read_by(transform: MultiStepTransform) -> list[NestedKey]:
-    """Entries of steps from which sums are computed."""
-    return [("next", key) for key in ("done", *transform.reward_keys)]

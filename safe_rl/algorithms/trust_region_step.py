@@ -15,7 +15,6 @@ from torchrl.objectives import LossModule
 
 from safe_rl.algorithms.algorithm_contract import PolicyUpdate
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.checks import Fraction
 from safe_rl.objectives.distributions import ReferencePolicy
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.samples import learning_samples
@@ -29,7 +28,6 @@ from safe_rl.objectives.trust_region import (
     flatten,
     mean_kl,
     policy_in,
-    subsample,
 )
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
@@ -76,7 +74,6 @@ class TRPOStep(PolicyUpdate):
         cg_iterations: Iterations of the conjugate gradient method, for every linear system.
         backtrack_coeff: Factor by which the line search shortens a step that it has rejected.
         max_backtracks: Largest number of tries of the line search, the full step included.
-        fisher_subsample: Share of the batch over which the Fisher matrix is averaged.
         actor_network: Policy that the step changes; by default ``loss.actor_network``.
 
     Examples:
@@ -103,7 +100,6 @@ class TRPOStep(PolicyUpdate):
         cg_iterations: Annotated[int, Interval(ge=1, le=10_000)],
         backtrack_coeff: Annotated[float, Interval(gt=0, lt=1)],
         max_backtracks: Annotated[int, Interval(ge=1, le=10_000)],
-        fisher_subsample: Fraction = 1.0,
         actor_network: ProbabilisticTensorDictSequential | None = None,
     ) -> None:
         self.loss = loss
@@ -113,7 +109,6 @@ class TRPOStep(PolicyUpdate):
             actor_network = loss.actor_network
         self.target_kl, self.damping, self.cg_iterations = target_kl, damping, cg_iterations
         self.backtrack_coeff, self.max_backtracks = backtrack_coeff, max_backtracks
-        self.fisher_subsample = fisher_subsample
         self.actor_network = actor_network
         self.parameters = [p for p in self.actor_network.parameters() if p.requires_grad]
 
@@ -142,8 +137,7 @@ class TRPOStep(PolicyUpdate):
         if isinstance(self.loss, SurrogateLoss):
             self.loss.prepare(batch, limits)
         losses = self.loss(batch)
-        sample = subsample(batch, self.fisher_subsample)
-        fisher = FisherProduct(self.actor_network, sample, self.parameters, self.damping)
+        fisher = FisherProduct(self.actor_network, batch, self.parameters, self.damping)
         proposal = self._propose(losses, fisher, limits)
         del fisher
         if not proposal.step.isfinite().all():

@@ -116,7 +116,7 @@ class CALLoss(SACLagrangianLoss):
         """Also compute d' from the predictions since the last call, J_c and its target."""
         super().prepare(batch, limits)
         total, number = self.predicted_costs
-        expected = discounted_share(self.cost_gamma, limits.length_for(limits.cost))
+        expected = discounted_share(self.gamma, limits.length_for(limits.cost))
         if number.any():
             news = torch.stack([total / number, limits.cost])
             self.known_costs.lerp_(news, 1 - self.ratio_memory)

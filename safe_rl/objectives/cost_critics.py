@@ -11,7 +11,6 @@ from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from safe_rl.checks import Share
 from safe_rl.objectives.cost_values import CostValues, MeanCosts
 from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.limits import LimitState
@@ -40,7 +39,6 @@ class CostCritics(QFunctionLoss):
         cost_keys: Keys of the costs below ``next``, [..., 1] each. Transitions over n steps need
             discounted sums of costs, and the end of their last step: `MultiStepTransform` with the
             costs in ``reward_keys``, and ``done_keys=[]``.
-        cost_gamma: Discount per step of the costs; None: that of the reward.
         cost_values: What the outputs of a critic mean; by default `MeanCosts`.
         pessimism: Number κ of standard deviations among the cost critics that is added to their
             mean in the actor's loss.
@@ -76,7 +74,6 @@ class CostCritics(QFunctionLoss):
         *,
         multiplier: Multiplier,
         cost_keys: Sequence[NestedKey],
-        cost_gamma: Share | None = None,
         cost_values: CostValues | None = None,
         pessimism: FiniteFloat = 0.0,
         target_pessimism: FiniteFloat | None = None,
@@ -103,7 +100,6 @@ class CostCritics(QFunctionLoss):
         self.out_keys = [
             *self.out_keys, "loss_cost_qvalue", "cost_qvalue", *self.cost_values.columns
         ]  # fmt: skip
-        self._cost_gamma = cost_gamma
         self.pessimism, self.target_pessimism = pessimism, target_pessimism
         self.lowest_cost_value = lowest_cost_value
         # not a part of the loss: its owner saves it
@@ -117,11 +113,6 @@ class CostCritics(QFunctionLoss):
         super()._set_in_keys()
         following = (("next", key) for key in (*self._read, *self.cost_keys))
         self._in_keys = list(dict.fromkeys([*self._in_keys, *self._read, *following]))
-
-    @property
-    def cost_gamma(self) -> float:
-        """Discount per step of the costs."""
-        return self.gamma if self._cost_gamma is None else self._cost_gamma
 
     def values_of_costs(
         self,
@@ -142,7 +133,7 @@ class CostCritics(QFunctionLoss):
         values = self.values_of_costs(steps, steps.get(keys.action))
         costs = torch.cat([self.column(steps, key) for key in self.cost_keys], -1)
         ends = self.column(steps, keys.done), self.column(steps, keys.terminated)
-        return critic_bias(self.cost_values.mean(values).mean(0), costs, *ends, self.cost_gamma)
+        return critic_bias(self.cost_values.mean(values).mean(0), costs, *ends, self.gamma)
 
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
@@ -165,7 +156,7 @@ class CostCritics(QFunctionLoss):
             values = self.values_of_costs(following, next_action, "target")
             terminated = self.column(tensordict, self.tensor_keys.terminated)
             spanned = self.value_estimator.tensor_keys.steps_to_next_obs
-            discount = discount_of(tensordict, self.cost_gamma, spanned) * terminated.logical_not()
+            discount = discount_of(tensordict, self.gamma, spanned) * terminated.logical_not()
         predicted = self.values_of_costs(tensordict, tensordict.get(self.tensor_keys.action))
         errors = self.cost_values.errors(predicted, costs, discount, values, self.bounded)
         return self._mean(errors.sum(-1).sum(0), tensordict)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
@@ -64,16 +63,6 @@ def mean_kl(
 ) -> Tensor:
     """Mean over states of KL(π_θ ‖ reference), scalar."""
     return reference.kl(policy_in(actor_network, batch)).mean()
-
-
-def subsample(batch: TensorDictBase, fraction: float) -> TensorDictBase:
-    """A fraction of the samples of a flat batch [B]: evenly spaced ones, without randomness."""
-    if fraction == 1:
-        return batch
-    # The small numbers undo rounding, such as in 7 / 0.07 = 99.999….
-    count = math.ceil(batch.shape[0] * fraction - 1e-9)
-    index = (torch.arange(count, dtype=torch.float64) / fraction + 1e-9).long()
-    return batch[index.to(batch.device)]
 
 
 def conjugate_gradient(

@@ -84,14 +84,16 @@ ROLES: dict[str, Role] = {
 All other keys are EXPERIMENT.
 """
 
-# keys that configurations of archived runs lack -> the values that these runs had; keys with these
-# values are left out of comparisons
+# keys that configurations of archived runs lack, or those of new ones, as the keys are gone -> the
+# values that these runs have; keys with these values are left out of comparisons
 _SILENT: dict[str, Hashable] = {
     "env.physics": "cpu",
     "env.physics_buffers": 2.0,
     "env.observe_privileged": False,
     "loss.cost_gamma": None,
     "model.critic_observes": ("observation",),
+    "policy_update.fisher_subsample": 1.0,
+    "policy_update.rescale_violation": True,
 }
 
 

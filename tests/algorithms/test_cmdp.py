@@ -112,7 +112,7 @@ def trpo_pid(actor, cmdp):
 
 
 def cpo(actor, cmdp):
-    step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **TRUST_REGION)
+    step = CPOStep(CPOLoss(actor, entropy_coeff=0.0), **TRUST_REGION)
     return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 
@@ -158,9 +158,7 @@ def crpo(actor, cmdp):
 
 
 def pcpo(actor, cmdp):
-    step = PCPOStep(
-        CPOLoss(actor, entropy_coeff=0.0), projection="kl", rescale_violation=True, **TRUST_REGION
-    )
+    step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), projection="kl", **TRUST_REGION)
     return lambda batch, mean_costs: step(batch, state_of(cmdp, mean_costs))
 
 

@@ -69,9 +69,7 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
     actor, batch = make_case()
     batch["cost_advantage"] = batch["cost_advantage"][:, :1]
     matrix = dense_fisher(actor, batch)
-    step = PCPOStep(
-        CPOLoss(actor, entropy_coeff=0.0), projection=projection, rescale_violation=True, **SETTINGS
-    )
+    step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), projection=projection, **SETTINGS)
     losses = step.loss(batch)
     g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
     taken, _ = whole_step(step, batch, limit_state(violation))
@@ -90,7 +88,7 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
 def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violation):
     actor, batch = make_case()
     loss = CPOLoss(actor, entropy_coeff=0.0)
-    step = PCPOStep(loss, projection=projection, rescale_violation=True, **SETTINGS)
+    step = PCPOStep(loss, projection=projection, **SETTINGS)
     before = loss(batch)
     metrics = step(batch, limit_state(violation, -1e4))
     after = loss(batch)

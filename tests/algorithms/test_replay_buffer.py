@@ -20,7 +20,7 @@ IN_KEYS = [
 def make_memory(**keys):
     settings = {
         "capacity": 1000, "batch_size": 64, "in_keys": IN_KEYS,
-        "gammas": {"reward": 0.5, "cost": 0.5}, "n_steps": 1, "keep": True,
+        "summed": ["reward", "cost"], "gamma": 0.5, "n_steps": 1, "keep": True,
     }  # fmt: skip
     return Memory(**{**settings, **keys})
 
@@ -89,27 +89,6 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         reaches_the_end = time <= 5 <= time + length - 1
         assert step["next", "done"].item() is reaches_the_end
         assert step["next", "terminated"].item() is (reaches_the_end and terminates)
-
-
-def test_sums_may_have_discounts_of_their_own():
-    plain, own, copy = (
-        make_memory(n_steps=3),
-        *(make_memory(n_steps=3, gammas={"reward": 0.5, "cost": 0.9}) for _ in range(2)),
-    )
-    for first in range(0, 12, 4):
-        copy.load_state_dict(own.state_dict())
-        for memory in (plain, own, copy):
-            memory.extend(make_batch(first, 4, ends=[5]))
-    for memory in (plain, own, copy):
-        memory.end_rows()
-    expected, *found = (all_of(memory) for memory in (plain, own, copy))
-    for observation, step in expected.items():
-        for other in (each[observation] for each in found):
-            time, length = observation % 1000, int(step["steps_to_next_obs"])
-            cost = sum(0.9**i * (100 + time + i) for i in range(length))
-            assert other["next", "cost"].item() == pytest.approx(cost)
-            assert torch.equal(other["next", "reward"], step["next", "reward"])
-            assert torch.equal(other["next", "observation"], step["next", "observation"])
 
 
 def check_draws(memory, copy, batch):

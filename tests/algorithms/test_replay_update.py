@@ -49,8 +49,8 @@ def memory():
 def fill(**keys):
     generator = torch.Generator().manual_seed(0)
     memory = Memory(
-        capacity=100, batch_size=16, in_keys=make_update(0).loss.in_keys, gammas={"reward": 0.9},
-        n_steps=1, keep=False, **keys,
+        capacity=100, batch_size=16, in_keys=make_update(0).loss.in_keys, summed=["reward"],
+        gamma=0.9, n_steps=1, keep=False, **keys,
     )  # fmt: skip
     flags = torch.zeros(2, 40, 1, dtype=torch.bool)
     following = {"observation": torch.randn(2, 40, 3, generator=generator), "done": flags}

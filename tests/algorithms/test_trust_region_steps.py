@@ -1,7 +1,5 @@
 """TRPO and CPO: losses against finite differences, steps against their own optimality."""
 
-from functools import partial
-
 import pytest
 import torch
 from samples import (
@@ -39,9 +37,7 @@ def make_case(num_costs=1, batch_size=(400,)):
 
 
 def cpo_step(actor, **settings):
-    return CPOStep(
-        CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **(SETTINGS | settings)
-    )
+    return CPOStep(CPOLoss(actor, entropy_coeff=0.0), **(SETTINGS | settings))
 
 
 def kl_and_surrogates(actor, batch):
@@ -108,7 +104,7 @@ def test_without_a_gradient_there_is_no_step():
     assert torch.equal(flatten(actor.parameters()), before)
 
 
-@pytest.mark.parametrize("kind", [TRPOStep, partial(CPOStep, rescale_violation=True)])
+@pytest.mark.parametrize("kind", [TRPOStep, CPOStep])
 def test_rejected_step_leaves_the_policy_exactly_as_it_was(kind):
     actor, batch = make_case(0)
     before = flatten(actor.parameters()).detach().clone()
@@ -248,18 +244,6 @@ def test_cpo_without_cost_gradient_is_trpo():
     assert metrics["case"] == 0
     assert torch.equal(flatten(actor.parameters()), before)
     assert all(torch.as_tensor(value).isfinite().all() for value in metrics.values())
-
-
-def test_subsampled_fisher_steps_stay_in_the_trust_region():
-    actor, batch = make_case(1, (100, 40))
-    step = cpo_step(actor, fisher_subsample=0.1)
-    _, reward, before = kl_and_surrogates(actor, batch)
-    metrics = step(batch, limit_state(-2.0))
-    kl, better, after = kl_and_surrogates(actor, batch)
-    assert metrics["step_fraction"] > 0
-    assert 0.3 * DELTA < kl <= DELTA * 1.001
-    assert better > reward
-    assert after - before <= 0.02 + 1e-6
 
 
 def test_errors_say_what_to_change():

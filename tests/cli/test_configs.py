@@ -160,12 +160,12 @@ STOP = {"max_kl": 1.2 * 0.01, "step_beyond_kl": True}
 PPO = {"policy_update": {**FULL_BATCH, "optimizer": {**ADAM, "lr": 3e-4}, **STOP}}
 TRUST_REGION = {
     "target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
-    "max_backtracks": 10, "fisher_subsample": 1.0,
+    "max_backtracks": 10,
 }  # fmt: skip
 TRPO = {"policy_update": {"_target_": "safe_rl.algorithms.TRPOStep", **TRUST_REGION}}
 CPO = {
     "policy_update": {
-        "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION, "rescale_violation": True,
+        "_target_": "safe_rl.algorithms.CPOStep", **TRUST_REGION,
         "largest_required_decrease": None,
     }
 }  # fmt: skip

@@ -153,7 +153,7 @@ def test_every_update_takes_every_policy(kind):
     assert ppo(batch)["loss_objective"] < before
     for step, violation in (
         (TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS), None),
-        (CPOStep(CPOLoss(actor, entropy_coeff=0.0), rescale_violation=True, **SETTINGS), -5.0),
+        (CPOStep(CPOLoss(actor, entropy_coeff=0.0), **SETTINGS), -5.0),
     ):
         with torch.no_grad():  # another batch, of the policy as it is
             batch = actor(batch.select("observation", "advantage", "cost_advantage"))

@@ -116,7 +116,7 @@ def make_update(kind, actor):
         return MinibatchUpdate(loss, optimizer=sgd, num_passes=3, minibatch_size=None)
     settings = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8}
     if kind == "cpo":
-        return CPOStep(loss, rescale_violation=True, max_backtracks=10, **settings)
+        return CPOStep(loss, max_backtracks=10, **settings)
     return TRPOStep(loss, max_backtracks=10, **settings)
 
 

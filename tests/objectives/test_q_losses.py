@@ -223,24 +223,6 @@ def test_td3_learns_costs_for_actions_with_noise_that_is_cut_within_their_bounds
     assert (without.abs() < 0.5).all()  # so that one of the two is cut by the bounds
 
 
-@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
-def test_costs_may_have_a_discount_of_their_own(kind):
-    steps, found = make_steps(), {}
-    steps["steps_to_next_obs"] = torch.arange(1, 7).unsqueeze(-1)
-    for gammas in ((0.9, 0.5), (0.9, None), (0.5, None)):
-        torch.manual_seed(0)
-        keys = {"gamma": gammas[0], "cost_gamma": gammas[1]}
-        loss = make_loss(kind, lagrange(1.0, 1.0), **keys)
-        torch.manual_seed(1)
-        bias = loss.cost_bias(steps.unflatten(0, (2, 3)))
-        found[gammas] = loss.critic_losses(steps.clone()).set("bias", bias)
-    own, reward, cost = found.values()
-    assert own["loss_qvalue"] == reward["loss_qvalue"] != cost["loss_qvalue"]
-    for name in ("loss_cost_qvalue", "bias"):
-        assert torch.equal(own[name], cost[name])
-        assert not torch.equal(own[name], reward[name])
-
-
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_nothing_follows_an_end_but_something_a_time_out(kind):
     """Moving the target networks moves the losses of all steps but terminated ones."""

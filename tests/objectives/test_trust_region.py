@@ -22,7 +22,6 @@ from safe_rl.objectives.trust_region import (
     flat_gradient,
     flatten,
     policy_in,
-    subsample,
     unflatten,
 )
 
@@ -217,16 +216,3 @@ def test_a_loss_that_fails_in_the_search_leaves_the_parameters():
     with pytest.raises(FloatingPointError):
         backtracking_search([parameter], torch.ones(2), fails, coeff=0.8, max_tries=5)
     assert parameter.tolist() == [1.0, -1.0]
-
-
-def test_subsample_is_spread_over_the_batch():
-    batch = TensorDict(index=torch.arange(100), batch_size=[100])
-    assert subsample(batch, 0.1)["index"].tolist() == list(range(0, 100, 10))
-    assert subsample(batch, 1.0)["index"].tolist() == list(range(100))
-    for fraction in (0.01, 0.3, 0.6, 0.7, 0.9, 0.99):
-        index = subsample(batch, fraction)["index"]
-        assert len(index) == round(100 * fraction)
-        gaps = index.diff()
-        assert not len(gaps) or int(gaps.max() - gaps.min()) <= 1
-    assert subsample(batch[:5], 0.1)["index"].tolist() == [0]
-    assert subsample(batch[:95], 0.1)["index"].tolist() == list(range(0, 95, 10))
