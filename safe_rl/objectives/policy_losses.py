@@ -12,9 +12,6 @@ from torch import Tensor
 from safe_rl.checks import Fraction
 from safe_rl.objectives.surrogate import SurrogateLoss, WeighsCosts
 
-#: Which surrogates PPO clips besides that of the reward; see `PPOLagrangianLoss`.
-CostClipping = Literal["none", "pessimistic", "joint"]
-
 
 def clipped_gain(log_weight: Tensor, advantage: Tensor, clip_epsilon: Tensor) -> Tensor:
     """min(ρA, clip(ρ, 1 − ε, 1 + ε)A), [..., 1], of log ρ (Schulman et al. 2017, equation 7)."""
@@ -37,15 +34,13 @@ class PPOLoss(SurrogateLoss):
         settings: Those of every policy loss, see `SurrogateLoss`.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
         >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> with torch.no_grad():
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"] = torch.randn(8, 1)
-        >>> loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
-        >>> loss(batch)["kl"]
+        >>> PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)(batch)["kl"]
         tensor(0.)
     """
 
@@ -87,16 +82,14 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
       bounds the influence of a few samples, and with a high λ early stopping ends updates after a
       few steps;
     - ``"pessimistic"``: also each cost surrogate, E[max(ρA_c, clip(ρ)A_c)], so that it is never
-      below the unclipped one (Zhang et al. 2022, clipped costs);
-    - ``"joint"``: the objective as a whole, PPO on the advantage (A − Σᵢ λᵢ A_cᵢ) / (1 + Σᵢ λᵢ).
+      below the unclipped one (Zhang et al. 2022, clipped costs).
 
     This loss never trains the multipliers: call ``multiplier.update(limits)`` once per epoch, with
     a `LimitState`.
 
     Args:
         parts: Actor, and a multiplier with one λ per column of ``cost_advantage``.
-        cost_clipping: Whether the surrogates of costs are clipped: not, each one, or jointly with
-            the reward's.
+        cost_clipping: Whether the surrogates of costs are clipped.
         settings: Those of every clipped loss, see `PPOLoss`.
 
     Examples:
@@ -104,12 +97,13 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
         >>> from safe_rl.objectives.multipliers import LagrangeMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
-        >>> loss = PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
-        >>> loss.out_keys
+        >>> PPOLagrangianLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0).out_keys
         ['loss_objective', 'loss_entropy', 'clip_fraction', 'kl', 'entropy', 'ESS']
     """
 
-    def __init__(self, *parts: Any, cost_clipping: CostClipping = "none", **settings: Any) -> None:
+    def __init__(
+        self, *parts: Any, cost_clipping: Literal["none", "pessimistic"] = "none", **settings: Any
+    ) -> None:
         super().__init__(*parts, **settings)
         self.cost_clipping = cost_clipping
 
@@ -120,13 +114,6 @@ class PPOLagrangianLoss(WeighsCosts, PPOLoss):
         # the logarithm has an infinite slope at a ratio that has underflowed to 0
         log_weight = ratio.clamp_min(torch.finfo(ratio.dtype).tiny).log()
         return -clipped_gain(log_weight, -cost_advantage, self.clip_epsilon)
-
-    def _objective(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
-        if self.cost_clipping != "joint":
-            return super()._objective(tensordict, log_weight)
-        advantage = self._penalised_advantage(tensordict, log_weight)
-        advantage = advantage / (1 + self.multiplier.value.sum())
-        return clipped_gain(log_weight, advantage, self.clip_epsilon)
 
 
 class RCPOLoss(WeighsCosts, PPOLoss):
@@ -142,8 +129,7 @@ class RCPOLoss(WeighsCosts, PPOLoss):
         >>> from safe_rl.objectives import ProjectedMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.0, lr=0.001, highest=None)
-        >>> loss = RCPOLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
-        >>> "cost_advantage" in loss.in_keys
+        >>> RCPOLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0).has_costs
         True
     """
 
@@ -181,7 +167,7 @@ class TRPOLagrangianLoss(WeighsCosts, TRPOLoss):
         >>> from safe_rl.models import make_actor
         >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
         >>> multiplier = LagrangeMultiplier({"cost": 25.0}, init=1.0, lr=0.05)
-        >>> "cost_advantage" in TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0).in_keys
+        >>> TRPOLagrangianLoss(actor, multiplier, entropy_coeff=0.0).has_costs
         True
     """
 

@@ -85,9 +85,8 @@ class CUPLoss(WeighsCosts):
     with advantages of π_k, which collected the batch. h is from the article's bound for generalised
     advantage estimates. Here the loss is divided by 1 + h Σᵢ νᵢ, which does not change the minimum.
     Without this division, gradients grow with ν, and Adam's steps become so large that early
-    stopping ends an update after two steps. `anchor` stores π½ in the batch; a
-    `safe_rl.algorithms.MinibatchUpdate` calls it before its first step. ``kl`` is KL(π_θ ‖ π½). The
-    loss also reports the detached ``cost_surrogate`` [k], E[ρA_c].
+    stopping ends an update after two steps. `prepare` stores π½ in the batch. ``kl`` is
+    KL(π_θ ‖ π½). The loss also reports the detached ``cost_surrogate`` [k], E[ρA_c].
 
     Args:
         parts: Actor, of a distribution whose KL has a closed form, and a multiplier with one ν per
@@ -101,19 +100,13 @@ class CUPLoss(WeighsCosts):
         KeyError: When the loss is evaluated, if the batch does not hold π½.
 
     Examples:
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import LimitState, ProjectedMultiplier
+        >>> from safe_rl.objectives import ProjectedMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
         >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0)
         >>> loss = CUPLoss(actor, multiplier, gamma=0.99, lmbda=0.97, entropy_coeff=0.0)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.ones(8, 1)
-        >>> state = LimitState.of(cost=[25.0], limit=[25.0])
-        >>> losses = loss(loss.prepare(batch, state))  # of a policy that has not moved
-        >>> round(losses["loss_objective"].item(), 4)  # 0.5 h / (1 + 0.5 h)
-        0.665
+        >>> round(loss.cost_factor, 2)  # h
+        3.97
     """
 
     extra_out_keys = ("cost_surrogate",)

@@ -19,21 +19,8 @@ from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.samples import SharesTensors, inputs_of, require, sample_mask
 
 
-def lagrangian(reward_gain: Tensor, cost_gain: Tensor, multipliers: Tensor) -> Tensor:
-    """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ) per sample, [..., 1], from L_r [..., 1] and L_c [..., k].
-
-    The division keeps the step size of an optimiser independent of λ (Stooke, Achiam and
-    Abbeel 2020, section 4.4).
-    """
-    penalty = (cost_gain * multipliers).sum(-1, keepdim=True)
-    return (reward_gain - penalty) / (1 + multipliers.sum())
-
-
 def effective_sample_size(log_weight: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Kish's effective sample size of importance weights, as a fraction of the samples.
-
-    Weights are given by their logarithms; a bool mask of as many elements says which count.
-    """
+    """Kish's effective sample size of importance weights, as a fraction of the unmasked samples."""
     log_weight = log_weight.flatten()
     if mask is not None:
         log_weight = torch.where(mask.flatten(), log_weight, -torch.inf)
@@ -120,12 +107,7 @@ class SurrogateLoss(Checked, SharesTensors):
         """Prepare for the gradient steps on a batch, and return the batch.
 
         Call it with every batch, before the first step; a `safe_rl.algorithms.MinibatchUpdate` does
-        so. A loss with costs keeps the state of the limits. A loss that is measured relative to the
-        present policy writes this policy's parameters into the batch.
-
-        Args:
-            batch: Batch of any shape.
-            limits: State after this batch; a loss without costs needs none.
+        so. A loss with costs keeps the state of the limits after this batch.
         """
         if self.has_costs:
             self.limits = limits
@@ -251,15 +233,8 @@ class SurrogateLoss(Checked, SharesTensors):
         return advantage
 
     def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
-        """Objective per sample [..., 1]: the reward's alone if there is no multiplier."""
-        if self.multiplier is None:
-            return reward_gain
-        cost_gain = self._cost_gain(tensordict, ratio)
-        return lagrangian(reward_gain, cost_gain, self.multiplier.value.detach())
-
-    def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
-        """Cost surrogates per sample, [..., k]."""
-        return ratio * self._cost_advantage(tensordict)
+        """Objective per sample, [..., 1]: that of the reward alone."""
+        return reward_gain
 
 
 class WeighsCosts(SurrogateLoss):
@@ -296,6 +271,20 @@ class WeighsCosts(SurrogateLoss):
         """Cost advantages in units of one cost, A_c / u, [..., k]."""
         advantage = super()._cost_advantage(tensordict)
         return advantage / self._unit(advantage)
+
+    def _cost_gain(self, tensordict: TensorDictBase, ratio: Tensor) -> Tensor:
+        """Cost surrogates per sample, [..., k]."""
+        return ratio * self._cost_advantage(tensordict)
+
+    def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
+        """(L_r − Σᵢ λᵢ L_cᵢ) / (1 + Σᵢ λᵢ) per sample, [..., 1].
+
+        The division keeps the step size of an optimiser independent of λ (Stooke, Achiam and
+        Abbeel 2020, section 4.4).
+        """
+        multipliers = self.multiplier.value
+        penalty = (self._cost_gain(tensordict, ratio) * multipliers).sum(-1, keepdim=True)
+        return (reward_gain - penalty) / (1 + multipliers.sum())
 
     def _unit(self, like: Tensor) -> Tensor | float:
         """u, [k], with the dtype and device of a tensor."""

@@ -9,7 +9,7 @@ from torchrl.data import Bounded
 
 from safe_rl.models import QEnsemble, make_squashed_actor
 from safe_rl.objectives import CALLoss, LagrangeMultiplier, LimitState
-from safe_rl.objectives.cal import discounted_share
+from safe_rl.objectives.sac import discounted_share
 
 COSTS = ["cost", "cost_other"]
 

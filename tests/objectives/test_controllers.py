@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from safe_rl.objectives import LimitState
-from safe_rl.objectives.controllers import PIDMultiplier, PIMultiplier
+from safe_rl.objectives.multipliers import PIDMultiplier, PIMultiplier
 
 GAINS = {"init": 0.0, "kp": 2.0, "ki": 0.2, "saturation": 1.0, "highest": 5.0}
 
