@@ -130,9 +130,6 @@ class CPOStep(TRPOStep):
         }
 
 
-Projection = Literal["kl", "l2"]
-
-
 def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     """Multipliers of the projection onto half-spaces bᵢᵀx + cᵢ ≤ 0, in the metric L.
 
@@ -146,10 +143,6 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
 
     Returns:
         ν, [k]; 0 if no point is in all half-spaces.
-
-    Examples:
-        >>> nearest_feasible(torch.tensor([2.0, -1.0]), torch.tensor([[4.0, 0.0], [0.0, 1.0]]))
-        tensor([0.5000, 0.0000])
     """
     lengths = gram.double().diagonal().clamp_min(0).sqrt()
     scale = torch.where(lengths > 1e-8, 1 / lengths, 0.0)
@@ -186,22 +179,15 @@ class PCPOStep(CPOStep):
         settings: Settings of a `CPOStep` and of every trust-region step, see `TRPOStep`.
 
     Examples:
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import CPOLoss, LimitState
+        >>> from safe_rl.objectives import CPOLoss
         >>> actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> settings = {"projection": "kl", "damping": 0.1, **search}
-        >>> step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), target_kl=0.01, **settings)
-        >>> metrics = step(batch, LimitState.of(cost=[0.0], limit=[1e6], length=50.0))
-        >>> metrics["nu"]  # far inside, TRPO's step
-        tensor([0.])
+        >>> settings = {"target_kl": 0.01, "damping": 0.1, **search}
+        >>> step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), projection="kl", **settings)
     """
 
-    def __init__(self, loss: Loss, *, projection: Projection, **settings: Any) -> None:
+    def __init__(self, loss: Loss, *, projection: Literal["kl", "l2"], **settings: Any) -> None:
         super().__init__(loss, **settings)
         self.projection = projection
 

@@ -21,13 +21,12 @@ from safe_rl.objectives.samples import learning_samples
 from safe_rl.objectives.surrogate import SurrogateLoss
 from safe_rl.objectives.trust_region import (
     FisherProduct,
-    backtracking_search,
     best_in_span,
     conjugate_gradient,
     flat_gradient,
     flatten,
-    mean_kl,
     policy_in,
+    set_parameters,
 )
 
 Loss = Callable[[TensorDictBase], TensorDictBase]
@@ -35,7 +34,7 @@ Loss = Callable[[TensorDictBase], TensorDictBase]
 
 
 def require_limits(limits: LimitState | None) -> LimitState:
-    """The state of the limits, which a constrained step cannot do without."""
+    """The state of the limits, which constrained steps need."""
     if limits is None:
         raise ValueError(
             "A constrained step needs the state of the limits: pass what "
@@ -85,8 +84,8 @@ class TRPOStep(PolicyUpdate):
         ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
         >>> batch["advantage"] = torch.randn(8, 1)
         >>> search = {"cg_iterations": 10, "backtrack_coeff": 0.8, "max_backtracks": 10}
-        >>> loss = TRPOLoss(actor, entropy_coeff=0.01)
-        >>> step = TRPOStep(loss, target_kl=0.01, damping=0.1, **search)
+        >>> region = {"target_kl": 0.01, "damping": 0.1, **search}
+        >>> step = TRPOStep(TRPOLoss(actor, entropy_coeff=0.01), **region)
         >>> bool(step(batch)["kl"] <= 0.01)
         True
     """
@@ -196,26 +195,28 @@ class TRPOStep(PolicyUpdate):
     def _search(
         self, batch: TensorDictBase, reference: ReferencePolicy, proposal: Proposal
     ) -> dict[str, Tensor]:
-        divergences: list[Tensor] = []  # of every try
-        losses: list[TensorDictBase] = []  # of those within the trust region
-
-        def accept() -> bool:
-            divergences.append(mean_kl(reference, self.actor_network, batch))
-            if not divergences[-1] <= self.target_kl:
-                return False
-            losses.append(self.loss(batch))
-            return proposal.is_acceptable(losses[-1], divergences[-1])
-
+        """Change the parameters by the first acceptable fraction of a step, if there is one."""
+        start, accepted, rejected = flatten(self.parameters).detach(), 0.0, 0
         max_tries = self.max_backtracks if proposal.step.any() else 0
-        fraction = backtracking_search(
-            self.parameters, proposal.step, accept, coeff=self.backtrack_coeff, max_tries=max_tries
-        )
-        after = losses[-1] if fraction else self.loss(batch)
+        try:
+            while not accepted and rejected < max_tries:
+                fraction = self.backtrack_coeff**rejected
+                set_parameters(self.parameters, start + fraction * proposal.step)
+                kl = reference.kl(policy_in(self.actor_network, batch)).mean()
+                if kl <= self.target_kl and proposal.is_acceptable(after := self.loss(batch), kl):
+                    accepted = fraction
+                else:
+                    rejected += 1
+        finally:  # also if the loss raises an error
+            if not accepted:
+                set_parameters(self.parameters, start)
+        if not accepted:
+            after, kl = self.loss(batch), proposal.step.new_zeros(())
         return {
             **after.to_dict(),
-            "kl": divergences[-1] if fraction else proposal.step.new_zeros(()),
-            "step_fraction": torch.tensor(fraction),
-            "backtracks": torch.tensor(len(divergences) - bool(fraction)),
+            "kl": kl,
+            "step_fraction": torch.tensor(accepted),
+            "backtracks": torch.tensor(rejected),
         }
 
     def loss_modules(self) -> dict[str, nn.Module]:

@@ -1,4 +1,4 @@
-"""Functions for trust-region steps: flat parameters, KL, Fisher matrix, solvers, line search."""
+"""Functions for trust-region steps: flat parameters, Fisher matrix, solvers."""
 
 from __future__ import annotations
 
@@ -55,16 +55,6 @@ def policy_in(
         return actor_network.get_dist(inputs_of(actor_network, batch))
 
 
-@torch.no_grad()
-def mean_kl(
-    reference: ReferencePolicy,
-    actor_network: ProbabilisticTensorDictSequential,
-    batch: TensorDictBase,
-) -> Tensor:
-    """Mean over states of KL(π_θ ‖ reference), scalar."""
-    return reference.kl(policy_in(actor_network, batch)).mean()
-
-
 def conjugate_gradient(
     product: Callable[[Tensor], Tensor], right: Tensor, iterations: int, tolerance: float = 1e-10
 ) -> tuple[Tensor, Tensor]:
@@ -78,10 +68,6 @@ def conjugate_gradient(
 
     Returns:
         x, [P], which may not have converged; and A x, which needs no further product.
-
-    Examples:
-        >>> conjugate_gradient(lambda x: 2 * x, torch.tensor([2.0, 4.0]), iterations=10)
-        (tensor([1., 2.]), tensor([2., 4.]))
     """
     solution = torch.zeros_like(right)
     residual, direction = right.clone(), right.clone()
@@ -99,19 +85,12 @@ def conjugate_gradient(
 
 
 def best_in_span(solutions: Tensor, images: Tensor, right: Tensor) -> Tensor:
-    """Solve A x = right for several right-hand sides within the span of approximate solutions.
+    """Solve A x = right [m, P] within the span of approximate solutions xᵢ, [m, P].
 
     These are the Galerkin solutions: of all combinations of the approximate solutions, the best in
     the norm of A. Solutions of conjugate gradients that were stopped early do not agree with each
-    other, but these do: for any two, xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ.
-
-    Args:
-        solutions: Approximate solutions xᵢ, [m, P]; any of them may depend on others or be 0.
-        images: A xᵢ, [m, P].
-        right: Right-hand sides, [m, P].
-
-    Returns:
-        Solutions, [m, P].
+    other, but these do: for any two, xᵢᵀ A xⱼ = rightᵢᵀ xⱼ = rightⱼᵀ xᵢ. `images` are A xᵢ, [m, P].
+    Approximate solutions may depend on others, or be 0.
     """
     gram = solutions.double() @ images.double().T
     lengths = gram.diagonal().clamp_min(0).sqrt()
@@ -122,41 +101,6 @@ def best_in_span(solutions: Tensor, images: Tensor, right: Tensor) -> Tensor:
     inverse = torch.linalg.pinv(cosines, rtol=_SAME_DIRECTION, hermitian=True) * scale
     combinations = (right.double() @ solutions.double().T) @ inverse
     return combinations.to(solutions) @ solutions
-
-
-def backtracking_search(
-    parameters: Sequence[nn.Parameter],
-    step: Tensor,
-    accept: Callable[[], bool],
-    *,
-    coeff: float,
-    max_tries: int,
-) -> float:
-    """Change parameters by a step, which is shortened until it is accepted.
-
-    Args:
-        parameters: Changed in place; they keep their old values if no step is accepted or `accept`
-            raises.
-        step: Full step, [P].
-        accept: Called after the parameters have been changed; whether the step is accepted.
-        coeff: Factor in (0, 1) between one try and the next.
-        max_tries: Number of tries, the full step included.
-
-    Returns:
-        The accepted fraction of the step: a power of `coeff`, or 0 if none was accepted.
-    """
-    start, accepted = flatten(parameters).detach(), 0.0
-    try:
-        for tries in range(max_tries):
-            fraction = coeff**tries
-            set_parameters(parameters, start + fraction * step)
-            if accept():
-                accepted = fraction
-                break
-    finally:
-        if not accepted:
-            set_parameters(parameters, start)
-    return accepted
 
 
 #: Outputs of a policy's network, and multiplication by the Fisher matrix with respect to them.
@@ -197,7 +141,7 @@ def _geometry_by_differentiation(
     """Hessian of the mean KL(π ‖ π_k) with respect to the distribution's parameters, at π_k.
 
     At π_k the gradient of the divergence is 0. So JᵀMJ, where M is this Hessian, is the complete
-    Hessian with respect to θ. The graph of M does not contain the network itself.
+    Hessian with respect to θ.
     """
     sampler = sampler_of(actor)
     parameters = actor.get_dist_params(inputs_of(actor, batch)).select(*sampler.in_keys)

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch.distributions import Normal, kl_divergence
 
 from safe_rl.algorithms import CPOStep, TRPOStep
+from safe_rl.algorithms.trust_region_step import Proposal
 from safe_rl.objectives import CPOLoss, LagrangeMultiplier, TRPOLagrangianLoss, TRPOLoss
 from safe_rl.objectives.gae import normalise_advantages
 from safe_rl.objectives.trust_region import FisherProduct, conjugate_gradient, flatten, policy_in
@@ -120,6 +121,37 @@ def test_rejected_step_leaves_the_policy_exactly_as_it_was(kind):
     assert metrics["step_fraction"] == 0
     assert metrics["backtracks"] == 10
     assert metrics["kl"] == 0
+    assert torch.equal(flatten(actor.parameters()), before)
+
+
+class OwnStep(TRPOStep):
+    """A step of the same size for every parameter, and a criterion of the test's own."""
+
+    def _propose(self, losses, fisher, limits):
+        step = torch.full_like(flatten(self.parameters).detach(), 1e-5)
+        return Proposal(step, self.is_acceptable, {})
+
+
+@pytest.mark.parametrize(("answers", "fraction"), [([1], 1.0), ([0, 0, 1], 0.64), ([0] * 10, 0.0)])
+def test_the_search_takes_the_first_acceptable_fraction(answers, fraction):
+    actor, batch = make_case(0)
+    before, left = flatten(actor.parameters()).detach().clone(), iter(answers)
+    step = OwnStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)
+    step.is_acceptable = lambda losses, kl: bool(next(left))
+    metrics = step(batch)
+    assert metrics["step_fraction"].item() == pytest.approx(fraction)
+    assert metrics["backtracks"] == len(answers) - (fraction > 0)
+    moved = flatten(actor.parameters()) - before
+    torch.testing.assert_close(moved, torch.full_like(moved, fraction * 1e-5), rtol=0, atol=1e-7)
+
+
+def test_a_loss_that_fails_in_the_search_leaves_the_parameters():
+    actor, batch = make_case(0)
+    before = flatten(actor.parameters()).detach().clone()
+    step = OwnStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)
+    step.is_acceptable = lambda losses, kl: 1 / 0
+    with pytest.raises(ZeroDivisionError):
+        step(batch)
     assert torch.equal(flatten(actor.parameters()), before)
 
 

@@ -1,6 +1,5 @@
 """Pieces of trust-region steps against dense linear algebra and finite differences."""
 
-import math
 from functools import partial
 
 import pytest
@@ -16,7 +15,6 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from safe_rl.models import make_actor as make_tanh_actor
 from safe_rl.objectives.trust_region import (
     FisherProduct,
-    backtracking_search,
     best_in_span,
     conjugate_gradient,
     flat_gradient,
@@ -191,28 +189,3 @@ def test_flat_gradient_counts_unused_parameters_as_zero():
     used, unused = nn.Parameter(torch.ones(2)), nn.Parameter(torch.ones(3))
     gradient = flat_gradient((3 * used).sum(), [used, unused])
     assert gradient.tolist() == [3, 3, 0, 0, 0]
-
-
-@pytest.mark.parametrize(("limit", "fraction"), [(2.0, 1.0), (0.7, 0.64), (0.3, 0.0)])
-def test_backtracking_takes_the_first_acceptable_fraction(limit, fraction):
-    parameter = nn.Parameter(torch.tensor([1.0, -1.0]))
-    found = backtracking_search(
-        [parameter],
-        torch.tensor([1.0, 1.0]),
-        lambda: parameter[0].item() - 1 <= limit,
-        coeff=0.8,
-        max_tries=5,
-    )
-    assert math.isclose(found, fraction)
-    torch.testing.assert_close(parameter.data, torch.tensor([1.0, -1.0]) + found)
-
-
-def test_a_loss_that_fails_in_the_search_leaves_the_parameters():
-    parameter = nn.Parameter(torch.tensor([1.0, -1.0]))
-
-    def fails():
-        raise FloatingPointError("the loss is nan")
-
-    with pytest.raises(FloatingPointError):
-        backtracking_search([parameter], torch.ones(2), fails, coeff=0.8, max_tries=5)
-    assert parameter.tolist() == [1.0, -1.0]
