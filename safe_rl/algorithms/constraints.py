@@ -207,10 +207,6 @@ class Constraints(Resumable):
 
         Raises:
             ValueError: For any other shape.
-
-        Examples:
-            >>> Constraints({("agents", "cost"): 25.0}).column("violation", torch.tensor([5.0]))
-            {'violation_agents/cost': 5.0}
         """
         if value.numel() == 1 and (value.ndim == 0 or len(self.keys) != 1):
             return {name: value.item()}
@@ -226,7 +222,7 @@ class Constraints(Resumable):
 def check_cost_limits(
     cost_limits: Mapping[str, float], cost_keys: Sequence[str]
 ) -> dict[str, float]:
-    """Check that the environment has every key, and return the limits as a plain dictionary.
+    """The limits as a plain dictionary, if the environment has every key.
 
     Raises:
         ValueError: If a key is unknown.

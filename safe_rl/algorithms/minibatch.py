@@ -1,8 +1,4 @@
-"""Gradient updates: passes over one batch in minibatches, and their learning rate.
-
-The same class trains policies (PPO) and critics. Policy updates of another kind, such as
-trust-region steps, are also a `safe_rl.algorithms.algorithm_contract.PolicyUpdate`.
-"""
+"""Gradient updates of policies and critics: passes over one batch in minibatches."""
 
 from __future__ import annotations
 
@@ -48,13 +44,10 @@ class KLAdaptiveRate:
         low_kl: Share of the KL bound; if a whole update stays below, the rate is raised.
 
     Examples:
-        >>> adapt = KLAdaptiveRate(
-        ...     factor=2.0, lowest=1e-5, highest=1e-3, few_steps=0.5, low_kl=0.5
-        ... )
+        >>> shares = {"few_steps": 0.5, "low_kl": 0.5}
+        >>> adapt = KLAdaptiveRate(factor=2.0, lowest=1e-5, highest=1e-3, **shares)
         >>> adapt(4e-4, share_of_steps=0.2, share_of_kl=1.1)
         0.0002
-        >>> adapt(4e-4, share_of_steps=1.0, share_of_kl=0.3)
-        0.0008
     """
 
     factor: Annotated[float, Interval(gt=1)]
@@ -64,13 +57,7 @@ class KLAdaptiveRate:
     low_kl: Share
 
     def __call__(self, rate: float, *, share_of_steps: float, share_of_kl: float) -> float:
-        """Return the rate of the next update.
-
-        Args:
-            rate: Rate of this update.
-            share_of_steps: Gradient steps taken divided by gradient steps planned.
-            share_of_kl: Last measured KL divergence divided by its bound.
-        """
+        """The next rate, from shares of the planned steps and of the bound on the KL divergence."""
         if share_of_steps < self.few_steps:
             rate = rate / self.factor
         elif share_of_steps >= 1 and share_of_kl < self.low_kl:
@@ -274,23 +261,14 @@ class CUPUpdate(MinibatchUpdate):
     Examples:
         >>> from functools import partial
         >>> from safe_rl.models import make_actor
-        >>> from safe_rl.objectives import LimitState, PPOLoss, ProjectedMultiplier
+        >>> from safe_rl.objectives import PPOLoss, ProjectedMultiplier
         >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
-        >>> with torch.no_grad():
-        ...     batch = actor(TensorDict(observation=torch.randn(8, 3), batch_size=[8]))
-        >>> batch["advantage"], batch["cost_advantage"] = torch.randn(8, 1), torch.randn(8, 1)
-        >>> update = CUPUpdate(
-        ...     PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0),
-        ...     ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0),
-        ...     gamma=0.99,
-        ...     lmbda=0.97,
-        ...     optimizer=partial(torch.optim.Adam, lr=1e-3),
-        ...     num_passes=2,
-        ...     minibatch_size=None,
-        ... )
-        >>> state = LimitState.of(cost=[30.0], limit=[25.0])
-        >>> update(batch, state)["projection_num_steps"]
-        tensor(2)
+        >>> loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+        >>> multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=2.0)
+        >>> settings = {"optimizer": partial(torch.optim.Adam, lr=1e-3), "minibatch_size": None}
+        >>> update = CUPUpdate(loss, multiplier, gamma=0.99, lmbda=0.97, num_passes=2, **settings)
+        >>> list(update.loss_modules())
+        ['loss', 'loss.projection']
     """
 
     state_names = (*MinibatchUpdate.state_names, "projection")

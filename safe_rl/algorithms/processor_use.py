@@ -21,12 +21,6 @@ def prefers_onednn(cpuinfo: str) -> bool:
     MKL does not use half of the width of AMD's vector units. There oneDNN takes about half as long
     for products of minibatches. torch uses oneDNN only if products may be rounded to bfloat16.
     oneDNN really rounds only on processors with tile registers (AMX).
-
-    Examples:
-        >>> prefers_onednn("vendor_id : AuthenticAMD flags : fpu avx2 avx512f")
-        True
-        >>> prefers_onednn("vendor_id : GenuineIntel flags : fpu avx2 avx512f amx_tile")
-        False
     """
     words = set(cpuinfo.split())
     has_tiles = any(word.startswith("amx") for word in words)

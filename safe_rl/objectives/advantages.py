@@ -46,18 +46,14 @@ class VectorGAE(Checked, ValueEstimatorBase):
             there unless it terminated).
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_critic
-        >>> critic = make_critic(3, hidden_sizes=[8])
-        >>> estimator = VectorGAE(critic, gamma=0.99, lmbda=0.97, value_target="lambda_return")
-        >>> next = TensorDict(
-        ...     observation=torch.randn(2, 10, 3),
-        ...     reward=torch.randn(2, 10, 1),
-        ...     done=torch.zeros(2, 10, 1, dtype=torch.bool),
-        ...     terminated=torch.zeros(2, 10, 1, dtype=torch.bool),
-        ... )
-        >>> rollout = TensorDict(observation=torch.randn(2, 10, 3), next=next, batch_size=[2, 10])
+        >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
+        >>> estimator = VectorGAE(make_critic(3, hidden_sizes=[8]), **settings)
+        >>> seen, goes_on = torch.randn(2, 10, 3), torch.zeros(2, 10, 1, dtype=torch.bool)
+        >>> next = {"observation": seen, "reward": seen[..., :1], "done": goes_on}
+        >>> next["terminated"] = goes_on
+        >>> rollout = TensorDict(observation=seen, next=next, batch_size=[2, 10])
         >>> estimator(rollout)["advantage"].shape
         torch.Size([2, 10, 1])
     """
@@ -138,11 +134,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
     ) -> Tensor:
         """The value targets alone, [..., T, F]; the rollout stays as it is.
 
-        Args:
-            tensordict: Rollout [..., T] with `in_keys`.
-            target_params: Must be None, as in `forward`.
-            next_value: Values of the next observations, [..., T, F], instead of the network's.
-            kwargs: Arguments of TorchRL's other estimators; they are ignored.
+        Values of the next observations, [..., T, F], can be given instead of the network's.
         """
         return self._estimate(tensordict, None, next_value, target_params)[-1]
 
@@ -221,8 +213,7 @@ class CostGAE(VectorGAE):
 
     Examples:
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "return_to_go"}
-        >>> estimator = CostGAE(["cost_hazards", "cost_vases_contact"], None, **settings)
-        >>> estimator.out_keys
+        >>> CostGAE(["cost_hazards", "cost_vases_contact"], None, **settings).out_keys
         ['cost_advantage', 'cost_value_target']
     """
 
@@ -262,10 +253,8 @@ class JointAdvantages(TensorDictModuleBase):
 
     Examples:
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
-        >>> estimator = JointAdvantages(
-        ...     VectorGAE(None, **settings), CostGAE(["cost"], None, **settings)
-        ... )
-        >>> estimator.out_keys
+        >>> reward, cost = VectorGAE(None, **settings), CostGAE(["cost"], None, **settings)
+        >>> JointAdvantages(reward, cost).out_keys
         ['advantage', 'value_target', 'cost_advantage', 'cost_value_target']
     """
 

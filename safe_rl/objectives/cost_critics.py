@@ -42,8 +42,8 @@ class CostCritics(QFunctionLoss):
         cost_values: What the outputs of a critic mean; by default `MeanCosts`.
         pessimism: Number κ of standard deviations among the cost critics that is added to their
             mean in the actor's loss.
-        target_pessimism: Number κ' of standard deviations among the cost critics that is added to
-            their mean in TD targets; None: every critic bootstraps on its own target network.
+        target_pessimism: κ', the same in TD targets; None: every critic bootstraps on its own
+            target network.
         lowest_cost_value: Lower bound of the values that critics bootstrap on, such as 0 if no cost
             is negative; None: no bound.
         settings: Settings of the loss without costs.
@@ -120,7 +120,7 @@ class CostCritics(QFunctionLoss):
         action: Tensor,
         kind: Literal["own", "target", "frozen"] = "own",
     ) -> Tensor:
-        """Numbers of the E critics for actions, [n, E, ..., k]; arguments as of `q_values`."""
+        """Numbers of the E critics for actions, [n, E, ..., k]; see `q_values`."""
         outputs = self.q_values("cost_qvalue_network", steps, action, kind)
         return self.cost_values.arranged(outputs, len(self.cost_keys))
 
@@ -198,11 +198,6 @@ class CostCritics(QFunctionLoss):
 
 
 def pessimistic(values: Tensor, deviations: float) -> Tensor:
-    """Mean of an ensemble [E, ...] plus a number of its standard deviations, [...].
-
-    Examples:
-        >>> pessimistic(torch.tensor([1.0, 3.0]), deviations=1.0)
-        tensor(3.)
-    """
+    """Mean of an ensemble [E, ...] plus a number of its standard deviations, [...]."""
     mean = values.mean(0)
     return mean + deviations * values.std(0, correction=0) if deviations else mean

@@ -25,6 +25,10 @@ _SMALLEST = 1e-8
 """Lower bound of variances, so that their root has a finite slope, as in the published code."""
 
 
+Bounds = Callable[[Tensor], Tensor]
+"""Applies pessimism and bounds to costs [E, ...] to bootstrap on."""
+
+
 class CostValues(Checked, ABC):
     """The numbers that critics return for k costs of an action, [n, E, ..., k].
 
@@ -57,12 +61,7 @@ class CostValues(Checked, ABC):
 
     @abstractmethod
     def errors(
-        self,
-        values: Tensor,
-        costs: Tensor,
-        discount: Tensor,
-        following: Tensor,
-        bounded: Callable[[Tensor], Tensor],
+        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor, bounded: Bounds
     ) -> Tensor:
         """Distances of the numbers from their TD(0) targets, [E, ..., k].
 
@@ -71,7 +70,7 @@ class CostValues(Checked, ABC):
             costs: Costs of the steps, [..., k].
             discount: Discount of the next state's value, 0 if the episode terminated, [..., 1].
             following: Numbers of the target networks in the next state, [n, E, ..., k].
-            bounded: Applies pessimism and bounds to costs [E, ...] to bootstrap on.
+            bounded: Is applied to the costs to bootstrap on.
         """
 
     def figures(self, values: Tensor) -> dict[str, Tensor]:
@@ -92,12 +91,7 @@ class MeanCosts(CostValues):
         return values.squeeze(0)
 
     def errors(
-        self,
-        values: Tensor,
-        costs: Tensor,
-        discount: Tensor,
-        following: Tensor,
-        bounded: Callable[[Tensor], Tensor],
+        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor, bounded: Bounds
     ) -> Tensor:
         """Distances of the means from c + γ Q'; see `CostValues`."""
         target = costs + discount * bounded(self.mean(following))
@@ -105,12 +99,7 @@ class MeanCosts(CostValues):
 
 
 def gaussian_tail(tail: float) -> float:
-    """CVaR_α of a standard Gaussian, α⁻¹ φ(Φ⁻¹(α)): the mean of the largest fraction α in (0, 1].
-
-    Examples:
-        >>> round(gaussian_tail(0.5), 4), gaussian_tail(1.0)
-        (0.7979, 0.0)
-    """
+    """CVaR_α of a standard Gaussian, α⁻¹ φ(Φ⁻¹(α)): the mean of the largest fraction α."""
     standard = NormalDist()
     return 0.0 if tail == 1 else standard.pdf(standard.inv_cdf(tail)) / tail
 
@@ -171,12 +160,7 @@ class GaussianCosts(CostValues):
         return target, (second_moment - mean.square()).clamp_min(_SMALLEST)
 
     def errors(
-        self,
-        values: Tensor,
-        costs: Tensor,
-        discount: Tensor,
-        following: Tensor,
-        bounded: Callable[[Tensor], Tensor],
+        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor, bounded: Bounds
     ) -> Tensor:
         """Squared 2-Wasserstein distances; see `CostValues`."""
         mean, variance = self.moments(values)
@@ -212,8 +196,6 @@ class QuantileCosts(CostValues):
         >>> quantiles = torch.tensor([[4.0], [1.0], [3.0], [2.0]])
         >>> QuantileCosts(number=4, tail=0.5, huber=1.0).cost(quantiles)
         tensor([3.5000])
-        >>> QuantileCosts(number=4, tail=1.0, huber=1.0).cost(quantiles)
-        tensor([2.5000])
     """
 
     columns = ("cost_deviation",)
@@ -242,12 +224,7 @@ class QuantileCosts(CostValues):
         return torch.tensordot(weights.to(values), highest, 1)
 
     def errors(
-        self,
-        values: Tensor,
-        costs: Tensor,
-        discount: Tensor,
-        following: Tensor,
-        bounded: Callable[[Tensor], Tensor],
+        self, values: Tensor, costs: Tensor, discount: Tensor, following: Tensor, bounded: Bounds
     ) -> Tensor:
         """Huber losses of the quantiles; see `CostValues`."""
         later = bounded(following.movedim(0, -1))  # each quantile of its own

@@ -86,12 +86,6 @@ def solve_dual(q: Tensor, r: Tensor, S: Tensor, c: Tensor, delta: Tensor | float
     Returns:
         A `DualSolution`, in the dtype of `q`. For k = 1 its cases and multipliers are those of
         Achiam et al. 2017, appendix 10.2.
-
-    Examples:
-        >>> one, half = torch.ones(1), torch.full((1,), 0.5)
-        >>> solution = solve_dual(torch.tensor(1.0), half, one[None], -0.05 * one, 0.01)
-        >>> solution.case, solution.nu
-        (tensor(2), tensor([0.]))
     """
     delta = torch.as_tensor(delta, dtype=torch.float64, device=q.device)
     gradient = q.double().clamp_min(0).sqrt()

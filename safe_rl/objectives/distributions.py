@@ -92,10 +92,7 @@ def sampler_of(actor: ProbabilisticTensorDictSequential) -> ProbabilisticTensorD
 
 
 class ReferencePolicy:
-    """The current policy in the states of a batch, to measure the KL of later policies from it.
-
-    It is given by its distribution in these states, without gradients.
-    """
+    """The current policy's distribution in the states of a batch, without gradients."""
 
     def __init__(self, distribution: Distribution) -> None:
         self.distribution = distribution

@@ -29,15 +29,10 @@ _FEWEST_PIECES = 8
 
 
 class CostEstimate(NamedTuple):
-    """An estimate of J_c.
+    """An estimate of J_c, the undiscounted cost per episode."""
 
-    Attributes:
-        mean: Undiscounted cost per episode, [k].
-        error: Its standard error, [k].
-    """
-
-    mean: Tensor
-    error: Tensor
+    mean: Tensor  # [k]
+    error: Tensor  # its standard error, [k]
 
 
 def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
@@ -45,11 +40,6 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
 
     Costs are [N, T, k]: N rows of T consecutive steps. If there are few rows, they are cut into
     pieces that are taken as independent.
-
-    Examples:
-        >>> costs = torch.tensor([[0.0, 1.0], [1.0, 1.0]]).unsqueeze(-1)
-        >>> rate_estimate(costs, torch.tensor(8.0)).mean
-        tensor([6.])
     """
     rows, steps, num_costs = costs.shape
     cuts = min(steps, -(-_FEWEST_PIECES // rows))
@@ -62,18 +52,9 @@ def rate_estimate(costs: Tensor, length: Tensor) -> CostEstimate:
 def shrink(past: CostEstimate, present: CostEstimate, drift: Tensor) -> CostEstimate:
     """Average two estimates by their precision: one step of a Kalman filter on a random walk.
 
-    Args:
-        past: Estimate for the policies so far; NaN if there is none.
-        present: Estimate of this batch alone.
-        drift: Standard deviation of the change of J_c from one policy to the next, [k].
-
-    Returns:
-        The estimate for the present policy, with an error of at most `present.error`.
-
-    Examples:
-        >>> one, two = torch.ones(1), torch.tensor([2.0])
-        >>> shrink(CostEstimate(one, one), CostEstimate(two, one), drift=torch.zeros(1))
-        CostEstimate(mean=tensor([1.5000]), error=tensor([0.7071]))
+    `past` is the estimate for the policies so far, NaN if there is none, and `present` that of this
+    batch alone. `drift` is the standard deviation of the change of J_c from one policy to the next,
+    [k]. The result has an error of at most `present.error`.
     """
     variance = past.error.square() + drift.square()
     noise = present.error.square()
@@ -102,9 +83,6 @@ class EpisodeLengths(Resumable):
         >>> lengths.update(20_000, torch.full((400,), 50.0))
         >>> lengths.mean
         tensor(50.)
-        >>> lengths.update(20_000, torch.full((20,), 50.0))  # the others go on: 40,000 / 420
-        >>> lengths.mean.round()
-        tensor(95.)
     """
 
     state_names = ("counts",)

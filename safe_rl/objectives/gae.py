@@ -87,24 +87,12 @@ def normalise_advantages(
     by the mask of TorchRL's collectors, is ignored.
 
     Args:
-        tensordict: Batch of any shape with `advantage` [..., 1] and, if there are costs,
-            `cost_advantage` [..., k].
-        advantage: Key of the reward advantage.
-        cost_advantage: Key of the cost advantages.
+        tensordict: Batch of any shape.
+        advantage: Key of the reward advantage, [..., 1].
+        cost_advantage: Key of the cost advantages, [..., k], if there are any.
 
     Returns:
         The same TensorDict.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> batch = TensorDict(
-        ...     advantage=torch.tensor([[1.0], [3.0]]),
-        ...     cost_advantage=torch.tensor([[4.0], [8.0]]),
-        ...     batch_size=[2],
-        ... )
-        >>> normalise_advantages(batch)["cost_advantage"].squeeze(-1)
-        tensor([-2.,  2.])
     """
     mask = sample_mask(tensordict)
     samples = ... if mask is None else mask

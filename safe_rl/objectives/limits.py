@@ -102,11 +102,7 @@ class LimitState:
         return torch.where(change > 0, change / self.realised_share, change)
 
     def required_decrease_for(self, surrogates: Tensor) -> Tensor:
-        """`required_decrease` with the dtype and device of cost surrogates [k], and 0 for NaN.
-
-        Raises:
-            ValueError: If there is not one limit per surrogate.
-        """
+        """`required_decrease` with the dtype and device of cost surrogates [k], and 0 for NaN."""
         decrease = self.required_decrease
         if decrease.shape != surrogates.shape:
             raise ValueError(
@@ -125,11 +121,7 @@ class LimitState:
         return surrogates + decrease / self.length_for(surrogates)
 
     def length_for(self, surrogates: Tensor) -> Tensor:
-        """T̄ with the dtype and device of surrogates.
-
-        Raises:
-            ValueError: If it is not known.
-        """
+        """T̄ with the dtype and device of surrogates."""
         if self.length is None:
             raise ValueError(
                 "The state of the limits has no episode length, by which violations are divided: "
@@ -148,20 +140,8 @@ class PredictedChange(Resumable):
 
     The observed change of one update is mostly noise, but Σ predicted · observed / Σ predicted²
     over many updates is not. The share begins as 1, with the weight of one prediction of size
-    `prior`.
-
-    Args:
-        num_costs: k.
-        decay: Weight in [0, 1) of the past.
-        lowest: Lower bound of the share; with 1, predictions are not corrected.
-
-    Examples:
-        >>> realised = PredictedChange(1, decay=0.9, lowest=0.1)
-        >>> for cost in (100.0, 95.0, 90.0, 85.0):  # each time, 10 were predicted
-        ...     realised.update(torch.tensor([cost]), prior=torch.tensor([1.0]))
-        ...     realised.record_prediction(torch.tensor([-10.0]))
-        >>> realised.share
-        tensor([0.5013])
+    `prior`. `decay` is the weight of the past in these sums, in [0, 1), `lowest` the lower bound of
+    the share; with 1, predictions are not corrected.
     """
 
     state_names = ("_predicted", "_cost", "_products")
@@ -295,13 +275,7 @@ class LimitTracker(Checked, Resumable):
     def update(
         self, costs: Tensor, lengths: Tensor, penalised: PenalisedCosts | None = None
     ) -> LimitState:
-        """Update estimates and targets with a batch.
-
-        Args:
-            costs: Costs of its steps, [N, T, k].
-            lengths: Steps of every episode that finished in it, [E].
-            penalised: Costs that a risk measure puts in their place, or None.
-        """
+        """Update estimates and targets with a batch; arguments as of `EpisodeCosts.update`."""
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
         estimate = self.costs.update(costs, lengths, penalised)
         if penalised is not None:

@@ -26,17 +26,11 @@ from safe_rl.resumable import Resumable
 
 
 class PenalisedCosts(NamedTuple):
-    """The values that replace the costs of a batch.
+    """The values that replace the costs of a batch."""
 
-    Attributes:
-        costs: Those of the batch's steps, [N, T, k].
-        offset: Constant that is added to their sum over an episode, [k].
-        limit: Limit of the mean of this total over episodes, [k].
-    """
-
-    costs: Tensor
-    offset: Tensor
-    limit: Tensor
+    costs: Tensor  # of its steps, [N, T, k]
+    offset: Tensor  # is added to their sum over an episode, [k]
+    limit: Tensor  # of the mean of this total over episodes, [k]
 
 
 class RiskMeasure(Checked, Resumable, ABC):
@@ -81,13 +75,7 @@ def value_at_risk(costs: Tensor, tail: float) -> Tensor:
 
 
 def cost_so_far(costs: Tensor, ends: Tensor, before: Tensor) -> Tensor:
-    """Cost of the episode up to and with each step, [N, T, k]; arguments as of `RiskMeasure`.
-
-    Examples:
-        >>> costs, ends = torch.ones(1, 4, 1), torch.tensor([[False, True, False, False]])
-        >>> cost_so_far(costs, ends, before=torch.tensor([[10.0]])).flatten()
-        tensor([11., 12.,  1.,  2.])
-    """
+    """Cost of the episode up to and with each step, [N, T, k]; arguments as of `RiskMeasure`."""
     # in double precision, so that an episode without costs has a cost of exactly 0
     total = costs.double().cumsum(1) + before.unsqueeze(1)
     closed = torch.where(ends.unsqueeze(-1), total, 0).roll(1, 1)
