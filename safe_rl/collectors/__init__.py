@@ -6,11 +6,7 @@ from safe_rl.collectors.accounting import (
     EpisodeStatistics,
     check_steps,
 )
-from safe_rl.collectors.building import (
-    make_collector,
-    make_process_collector,
-    make_ray_collector,
-)
+from safe_rl.collectors.building import make_collector, make_process_collector, make_ray_collector
 from safe_rl.collectors.datasets import (
     read_columns,
     read_dataset,

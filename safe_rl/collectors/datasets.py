@@ -87,10 +87,6 @@ def safety_gymnasium_columns(columns: Sequence[str]) -> list[str]:
 
     Raises:
         ValueError: If the environment observes what their tasks do not.
-
-    Examples:
-        >>> safety_gymnasium_columns(["goal_lidar[0]", "goal_lidar[1]", "velocimeter[0]"])
-        ['velocimeter[0]', 'goal_lidar[0]', 'goal_lidar[1]']
     """
     kinds = [sub(r"\d", "#", name.partition("[")[0]) for name in columns]
     if unknown := set(kinds) - set(_SAFETY_GYMNASIUM):
@@ -106,14 +102,6 @@ def safe_episodes(steps: TensorDictBase, limits: Mapping[str, float]) -> TensorD
         steps: Consecutive steps [N, T]. The last episode of a row counts only if it has finished;
             an episode with a step marked as ``partial`` does not count.
         limits: Cost key -> undiscounted cost allowed per episode.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> done = torch.tensor([[False, True, False, True, False]]).unsqueeze(-1)
-        >>> cost = torch.tensor([[1.0, 1.0, 0.0, 1.0, 0.0]]).unsqueeze(-1)
-        >>> steps = TensorDict(next={"done": done, "cost": cost}, batch_size=[1, 5])
-        >>> safe_episodes(steps, {"cost": 1.0}).shape  # the second episode of three
-        torch.Size([1, 2])
     """
     ends = steps["next", "done"].squeeze(-1).long()
     episode = ends.cumsum(-1) - ends

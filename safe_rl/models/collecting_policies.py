@@ -40,12 +40,9 @@ class BehaviourPolicy(TensorDictModuleBase):
         actor: Policy made by `make_actor`, or by `assemble_actor` with the head "gaussian".
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_actor
-        >>> policy = BehaviourPolicy(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5))
-        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["scale"][0]
-        tensor([0.6065, 0.6065], grad_fn=<SelectBackward0>)
+        >>> BehaviourPolicy(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)).out_keys
+        ['loc', 'scale', 'action', 'action_log_prob']
     """
 
     def __init__(self, actor: ProbabilisticTensorDictSequential) -> None:
@@ -91,15 +88,11 @@ class ExploringPolicy(TensorDictModuleBase):
             collector receive it with the weights.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_squashed_actor
         >>> bounds = -torch.ones(2), torch.ones(2)
         >>> policy = ExploringPolicy(make_squashed_actor(3, *bounds, hidden_sizes=[8]), *bounds)
         >>> policy.is_random.fill_(True)
         tensor(True)
-        >>> policy(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].shape
-        torch.Size([5, 2])
     """
 
     low: Tensor
@@ -157,11 +150,9 @@ class HeldActions(TensorDictModuleBase):
         k: Steps for which an action is held.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from safe_rl.models import BehaviourPolicy, make_actor
-        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
-        >>> policy = HeldActions(BehaviourPolicy(actor), k=2)
+        >>> from safe_rl.models import make_actor
+        >>> policy = HeldActions(make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5), k=2)
         >>> steps = [TensorDict(observation=torch.randn(5, 3), batch_size=[5]) for _ in range(3)]
         >>> first, second, third = (policy(step)["action"] for step in steps)
         >>> bool((first == second).all()), bool((second == third).any())

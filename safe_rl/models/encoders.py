@@ -12,13 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec
 from torchrl.modules import ConvNet, GRUModule, set_recurrent_mode
 
-from safe_rl.models.networks import (
-    InputScale,
-    RunningScale,
-    Tanh,
-    input_scale_vector,
-    perceptron,
-)
+from safe_rl.models.networks import InputScale, RunningScale, Tanh, input_scale_vector, perceptron
 
 
 class Entry(NamedTuple):

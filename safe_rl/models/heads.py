@@ -72,11 +72,6 @@ def make_head(
 
     Raises:
         ValueError: If the head, or every head, is for other actions.
-
-    Examples:
-        >>> from torchrl.data import Categorical
-        >>> make_head("auto", Categorical(4, shape=(8,)), initial_log_std=-0.5).num_outputs
-        4
     """
     fitting = fitting_heads(action_spec)
     if not fitting:
@@ -153,7 +148,6 @@ class BoundedBeta(distributions.Independent):
     The concentrations ``alpha`` and ``beta`` are [..., A], the bounds [A].
 
     Examples:
-        >>> import torch
         >>> two = torch.full((4, 1), 2.0)
         >>> BoundedBeta(two, two, low=torch.tensor([0.0]), high=torch.tensor([6.0])).mean[0]
         tensor([3.])
@@ -204,14 +198,9 @@ def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device 
 
 
 def choices(logits: Tensor) -> distributions.Independent:
-    """Return a distribution of independent choices, one for each of A components of an action.
+    """Independent choices, one for each of A components of an action, from logits [..., A, C].
 
-    Args:
-        logits: [..., A, C]; components with fewer than C choices end with very low logits.
-
-    Examples:
-        >>> choices(torch.zeros(5, 2, 3)).log_prob(torch.zeros(5, 2)).exp()[0]
-        tensor(0.1111)
+    Components with fewer than C choices end with very low logits.
     """
     return distributions.Independent(distributions.Categorical(logits=logits), 1)
 

@@ -84,13 +84,7 @@ class _TanhFunction(torch.autograd.Function):
 
 
 class Chain(nn.Sequential):
-    """A sequence of modules, of which the first may take several inputs.
-
-    Examples:
-        >>> import torch
-        >>> Chain(nn.Bilinear(2, 3, 4), nn.Tanh())(torch.ones(5, 2), torch.ones(5, 3)).shape
-        torch.Size([5, 4])
-    """
+    """A sequence of modules, of which the first may take several inputs."""
 
     def forward(self, *inputs: Tensor) -> Any:
         """Run the modules."""
@@ -102,13 +96,9 @@ class Chain(nn.Sequential):
 
 
 class InputScale(nn.Module):
-    """Multiply the input by a fixed vector, so that all its components have similar ranges.
-
-    Args:
-        scale: Factors, shape [n], one per input component.
+    """Multiply the input [..., n] by fixed factors [n], so that its columns have similar ranges.
 
     Examples:
-        >>> import torch
         >>> InputScale(torch.tensor([0.1, 1.0]))(torch.tensor([[20.0, 3.0]]))
         tensor([[2., 3.]])
     """
@@ -120,7 +110,7 @@ class InputScale(nn.Module):
         self.register_buffer("scale", scale.detach().clone())
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Scale ``inputs``, shape [..., n]."""
+        """Scale ``inputs``."""
         return inputs * self.scale
 
 
@@ -137,10 +127,6 @@ def input_scale_vector(
     Returns:
         Factors, shape [n], or None if no named component is observed. A name that is not in
         ``layout`` is skipped, because robots with different sensors use the same configuration.
-
-    Examples:
-        >>> input_scale_vector({"gyro": 0.5}, {"gyro": slice(0, 2), "lidar": slice(2, 3)}, 3)
-        tensor([0.5000, 0.5000, 1.0000])
     """
     observed = {name: factor for name, factor in factors.items() if name in layout}
     if not observed:
@@ -170,7 +156,6 @@ class RunningScale(nn.Module):
         device: Device of the moments.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> scale = RunningScale(1, key="observation", clip=10.0)
         >>> scale.update(TensorDict(observation=torch.tensor([[1.0], [5.0]]), batch_size=[2]))
@@ -268,12 +253,8 @@ def make_actor(
         ``action_log_prob``, shape [...] without a trailing 1.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
-        >>> sample = actor(TensorDict({"observation": torch.zeros(5, 3)}, [5]))
-        >>> sample["action"].shape, sample["action_log_prob"].shape
-        (torch.Size([5, 2]), torch.Size([5]))
+        >>> make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5).out_keys
+        ['loc', 'scale', 'action', 'action_log_prob']
     """
     head = gaussian_head(action_size, initial_log_std, device)
     body = perceptron(observation_size, head.num_outputs, hidden_sizes, input_scale, device)
@@ -320,14 +301,11 @@ def make_critic(
         input_scale: Fixed factors, shape [observation_size], or None.
         device: Device of the parameters.
         out_key: Key of the value.
-        num_outputs: Number of values: 1 for the reward, K for K constrained costs.
+        num_outputs: Number of values: 1 for the reward, k for k constrained costs.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> critic = make_critic(3, hidden_sizes=[8], out_key="cost_value", num_outputs=2)
-        >>> critic(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["cost_value"].shape
-        torch.Size([5, 2])
+        >>> make_critic(3, hidden_sizes=[8], out_key="cost_value", num_outputs=2).out_keys
+        ['cost_value']
     """
     network = perceptron(observation_size, num_outputs, hidden_sizes, input_scale, device)
     return TensorDictModule(network, in_keys=["observation"], out_keys=[out_key])

@@ -9,11 +9,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import softplus
@@ -70,11 +66,8 @@ def make_squashed_actor(
         in_keys: Keys of the observation.
 
     Examples:
-        >>> from tensordict import TensorDict
-        >>> bounds = -torch.ones(2), torch.ones(2)
-        >>> actor = make_squashed_actor(3, *bounds, hidden_sizes=[8])
-        >>> actor(TensorDict({"observation": torch.zeros(5, 3)}, [5]))["action"].abs().max() < 1
-        tensor(True)
+        >>> make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]).out_keys
+        ['loc', 'scale', 'action', 'action_log_prob']
     """
     sizes = (observation_size, 2 * len(low))
     layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
@@ -102,11 +95,8 @@ def make_bounded_actor(
     Arguments are those of `make_squashed_actor`.
 
     Examples:
-        >>> from tensordict import TensorDict
-        >>> actor = make_bounded_actor(3, torch.zeros(1), torch.ones(1), hidden_sizes=[8])
-        >>> action = actor(TensorDict({"observation": torch.randn(5, 3)}, [5]))["action"]
-        >>> bool(((action > 0) & (action < 1)).all())
-        True
+        >>> make_bounded_actor(3, torch.zeros(1), torch.ones(1), hidden_sizes=[8]).out_keys
+        ['action']
     """
     sizes = (observation_size, len(low))
     layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
@@ -226,12 +216,7 @@ class EnsembleMLP(nn.Module):
                 parameters.append(nn.Parameter(values.uniform_(-bound, bound)))
 
     def forward(self, inputs: Tensor, layers: Layers | None = None) -> Tensor:
-        """Return outputs [E, …, n] of all networks for inputs […, m].
-
-        Args:
-            inputs: The same for every network.
-            layers: Parameters to use instead of the own ones, as `layers` returns them.
-        """
+        """Outputs [E, …, n] of all networks for inputs […, m], with own or given `layers`."""
         hidden = inputs.reshape(-1, inputs.shape[-1]).expand(self.num_networks, -1, -1)
         for number, (weight, bias) in enumerate(self.layers() if layers is None else layers):
             # in place, because the backward pass of a ReLU needs only its output
@@ -239,11 +224,7 @@ class EnsembleMLP(nn.Module):
         return hidden.reshape(self.num_networks, *inputs.shape[:-1], hidden.shape[-1])
 
     def layers(self, params: TensorDictBase | None = None) -> Layers:
-        """Return weights [E, m, n] and biases [E, 1, n] of every layer.
-
-        Args:
-            params: Parameters with the same names as the own ones; None takes these.
-        """
+        """Weights [E, m, n] and biases [E, 1, n] of every layer, own ones or from `params`."""
         if params is None:
             return list(zip(self.weights, self.biases, strict=True))
         names = map(str, range(len(self.weights)))
