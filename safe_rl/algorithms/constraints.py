@@ -94,10 +94,6 @@ class Constraints(Resumable):
         Lengths of episodes are in decisions (time steps of a batch), schedules in environment
         steps.
 
-        Args:
-            config: Configuration as composed from ``conf/``.
-            env: Environment that has the costs.
-
         Raises:
             ValueError: If a constrained algorithm has no limit, or a risk measure is named without
                 a tracker.
@@ -131,9 +127,6 @@ class Constraints(Resumable):
         Args:
             batch: Steps of the current policy, [N, T], in order of time.
             episodes: Statistics of the episodes in the batch.
-
-        Raises:
-            ValueError: If the batch has another number of dimensions.
         """
         if batch.ndim != 2:
             raise ValueError(

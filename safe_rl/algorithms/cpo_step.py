@@ -57,11 +57,7 @@ class CPOStep(TRPOStep):
     """
 
     def __init__(
-        self,
-        loss: Loss,
-        *,
-        largest_required_decrease: PositiveFloat | None = None,
-        **settings: Any,
+        self, loss: Loss, *, largest_required_decrease: PositiveFloat | None = None, **settings: Any
     ) -> None:
         super().__init__(loss, **settings)
         self.largest_required_decrease = largest_required_decrease

@@ -181,11 +181,7 @@ class OnPolicy(Algorithm):
 
 
 def _build_networks(
-    config: DictConfig,
-    env: EnvBase,
-    num_costs: int,
-    device: torch.device,
-    model: Mapping[str, Any],
+    config: DictConfig, env: EnvBase, num_costs: int, device: torch.device, model: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Networks of the node ``model``, by name; a ``_target_`` builds networks of the user's own."""
     if config.model.get("_target_") is not None:

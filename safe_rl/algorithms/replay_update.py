@@ -93,19 +93,15 @@ class ReplayUpdate(Checked):
         self._parameters = list(loss.parameters())
         self._device = self._parameters[0].device
         pairs = loss.target_pairs()
-        if tau is not None and not pairs:
-            raise ValueError(
-                f"tau={tau}: {type(loss).__name__} has no target networks: set it to null."
-            )
+        if (tau is None) != (not pairs):
+            advice = "no target networks: set it to null"
+            if pairs:
+                advice = "target networks, which would never change: set it to a step such as 0.01"
+            raise ValueError(f"tau={tau}: {type(loss).__name__} has {advice}.")
         # SoftUpdate equates the targets; its own steps are slow
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
         self._targets = [target.data for target, _ in pairs]
         self._sources = [source.data for _, source in pairs]
-        if pairs and tau is None:
-            raise ValueError(
-                f"tau is null, but {type(loss).__name__} has target networks: they would never "
-                "change. Set the step towards the networks, such as tau=0.01."
-            )
         # optimisers without this setting may count their steps in Python
         is_capturable = "capturable" in self.optimizer.defaults
         self._uses_graphs = cuda_graph and is_capturable and self._device.type == "cuda"

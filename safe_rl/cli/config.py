@@ -115,7 +115,7 @@ class Model:
     input_scale: dict[str, PositiveFloat]  # factors by component of the observation
     critic_observes: list[Literal["observation", "privileged"]]  # entries that critics read
     # distribution of the actions
-    head: Literal["auto", "gaussian", "tanh", "beta", "categorical", "one_hot"]
+    head: Literal["auto", "gaussian", "tanh", "categorical", "one_hot"]
     # bound of normalised observations; null: they are not normalised
     normalise: PositiveFloat | None
     encoders: Encoders | None  # encoders of the entries of an observation

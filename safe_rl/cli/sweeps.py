@@ -133,7 +133,7 @@ class Summary(Callback):
         """Note that a job has begun; another line follows unless it is interrupted."""
         if config.hydra.mode == RunMode.MULTIRUN:
             if os.getppid() == self._process:
-                from safe_rl.collectors.processes import end_with_parent  # with torch
+                from safe_rl.collectors.workers import end_with_parent  # with torch
 
                 # otherwise the job would go on, or wait for ever, after the sweep was killed
                 end_with_parent(_GRACE)

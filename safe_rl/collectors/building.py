@@ -15,8 +15,13 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
 from safe_rl.checks import checked
-from safe_rl.collectors.processes import starting_processes
-from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector, check_batch
+from safe_rl.collectors.workers import (
+    MakeEnv,
+    Makers,
+    WorkerCollector,
+    check_batch,
+    starting_processes,
+)
 from safe_rl.extras import import_extra
 
 

@@ -47,8 +47,7 @@ def build_networks(
         layout: Component -> columns of the flat observation.
         num_costs: Outputs of the cost critic.
         device: Device of all parameters.
-        privileged_layout: Component -> columns of the entry ``privileged``, which critics read if
-            ``model.critic_observes`` names it.
+        privileged_layout: Component -> columns of the entry ``privileged``.
 
     Raises:
         ValueError: If the configuration does not fit the environment.

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 from tensordict.nn import AddStateIndependentNormalScale, ProbabilisticTensorDictModule
 from torch import Tensor, distributions, nn
-from torch.nn.functional import pad, softplus
+from torch.nn.functional import pad
 from torchrl.data import (
     Binary,
     Bounded,
@@ -26,16 +26,12 @@ from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, OneHotCategorical, TanhNormal
 
 AUTO = "auto"
-Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 # The scale of a policy is exp(log std). The floor is far below the values in use, and only prevents
 # a division by zero.
 _SCALE_FLOOR = 1e-6
 # Logit of choices that do not exist: probability 0, with finite gradients.
 _NO_CHOICE = -1e9
-# Samples of a Beta distribution keep this distance from 0 and 1, where densities are 0 or infinite.
-# In single precision they may be rounded to 0 and 1.
-_EDGE = 1e-6
 
 
 class Head(NamedTuple):
@@ -67,7 +63,7 @@ def make_head(
         kind: A key of `HEADS`, or "auto".
         action_spec: Spec of the actions of N environments: [N, A] bounded, [N] or [N, A] integers,
             or [N, C] one-hot.
-        initial_log_std: Initial logarithm of the standard deviation of normal distributions.
+        initial_log_std: Of normal distributions.
         device: Device of the parameters.
 
     Raises:
@@ -92,7 +88,7 @@ def fitting_heads(spec: TensorSpec) -> tuple[str, ...]:
     """Return the heads for the actions of N environments, the usual one first."""
     is_matrix, is_real = len(spec.shape) == 2, spec.dtype.is_floating_point
     if isinstance(spec, Bounded) and is_real:
-        return ("gaussian", "tanh", "beta") if is_matrix else ()
+        return ("gaussian", "tanh") if is_matrix else ()
     if isinstance(spec, OneHot) and not isinstance(spec, MultiOneHot):
         return ("one_hot",) if is_matrix else ()
     is_choice = isinstance(spec, Categorical) and not isinstance(spec, Binary)
@@ -135,60 +131,6 @@ def _tanh(spec: TensorSpec, initial_log_std: float, device: torch.device | None)
     return head._replace(distribution=partial(TanhNormal, low=low, high=high))
 
 
-def _beta(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
-    low, high = _bounds(spec, device)
-    make = partial(BoundedBeta, low=low, high=high)
-    return Head(2 * spec.shape[-1], _Concentrations(), ("alpha", "beta"), make)
-
-
-class BoundedBeta(distributions.Independent):
-    """A Beta distribution in each component of an action between bounds (Chou et al. 2017).
-
-    Its KL divergence is that of the Beta distributions, because it does not depend on the bounds.
-    The concentrations ``alpha`` and ``beta`` are [..., A], the bounds [A].
-
-    Examples:
-        >>> two = torch.full((4, 1), 2.0)
-        >>> BoundedBeta(two, two, low=torch.tensor([0.0]), high=torch.tensor([6.0])).mean[0]
-        tensor([3.])
-    """
-
-    def __init__(self, alpha: Tensor, beta: Tensor, *, low: Tensor, high: Tensor) -> None:
-        super().__init__(distributions.Beta(alpha, beta), 1)
-        self._low, self._width = low, high - low
-
-    def rsample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
-        """Draw actions, differentiably."""
-        return self._stretched(super().rsample(sample_shape))
-
-    def sample(self, sample_shape: Shape = torch.Size()) -> Tensor:  # noqa: B008
-        """Draw actions."""
-        with torch.no_grad():
-            return self.rsample(sample_shape)
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Logarithm of the density of actions [..., A], in the action's units."""
-        unit = ((value - self._low) / self._width).clamp(_EDGE, 1 - _EDGE)
-        return super().log_prob(unit) - self._width.log().sum(-1)
-
-    def entropy(self) -> Tensor:
-        """Entropy in closed form, [...]."""
-        return super().entropy() + self._width.log().sum(-1)
-
-    @property
-    def mean(self) -> Tensor:
-        """Mean action, [..., A]."""
-        return self._stretched(self.base_dist.mean)
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The mean, because the mode is at a bound if a concentration is 1."""
-        return self.mean
-
-    def _stretched(self, unit: Tensor) -> Tensor:
-        return self._low + self._width * unit.clamp(_EDGE, 1 - _EDGE)
-
-
 def _categorical(spec: TensorSpec, initial_log_std: float, device: torch.device | None) -> Head:
     """One logit per choice; an action of shape [N] has no dimension of components."""
     numbers = _num_choices(spec)
@@ -203,14 +145,6 @@ def choices(logits: Tensor) -> distributions.Independent:
     Components with fewer than C choices end with very low logits.
     """
     return distributions.Independent(distributions.Categorical(logits=logits), 1)
-
-
-class _Concentrations(nn.Module):
-    """Two concentrations above 1 per component: densities are unimodal (Chou et al. 2017)."""
-
-    def forward(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        alpha, beta = (1 + softplus(outputs)).chunk(2, -1)
-        return alpha, beta
 
 
 class _Components(nn.Module):
@@ -246,7 +180,6 @@ def _num_choices(spec: TensorSpec) -> list[int]:
 HEADS: Mapping[str, Callable[[TensorSpec, float, torch.device | None], Head]] = {
     "gaussian": lambda spec, log_std, device: gaussian_head(spec.shape[-1], log_std, device),
     "tanh": _tanh,
-    "beta": _beta,
     "categorical": _categorical,
     "one_hot": lambda spec, *_: Head(spec.shape[-1], nn.Identity(), ("logits",), OneHotCategorical),
 }

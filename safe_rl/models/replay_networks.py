@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -17,10 +17,11 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, NormalParamExtractor, TanhNormal
 
-from safe_rl.models.heads import Shape, action_sampler
+from safe_rl.models.heads import action_sampler
 from safe_rl.models.networks import Chain, InputScale
 
 _SCALE_FLOOR = 1e-3
+Shape: TypeAlias = torch.Size | list[int] | tuple[int, ...]
 
 
 def _perceptron(

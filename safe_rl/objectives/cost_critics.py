@@ -84,11 +84,6 @@ class CostCritics(QFunctionLoss):
         check_ensemble(cost_qvalue_network, "cost critic")
         self.cost_values = MeanCosts() if cost_values is None else cost_values
         self.risk_measure = self.cost_values.risk_measure
-        if (number := cost_qvalue_network.num_networks) % self.cost_values.networks:
-            raise ValueError(
-                f"There are {number} networks of cost critics, and "
-                f"{type(self.cost_values).__name__} takes {self.cost_values.networks} for each one."
-            )
         # the base's constructor makes in_keys of these
         self.cost_keys, self._read = list(cost_keys), list(cost_qvalue_network.in_keys[:-1])
         if multiplier.num_costs != len(self.cost_keys):

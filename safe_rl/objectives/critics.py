@@ -34,17 +34,10 @@ def critic_bias(
     Costs are summed to the end of the episode. If the end of a row or a time-out cuts an episode,
     later costs are unknown. Then the critic's prediction at the last step replaces them, and a step
     n steps before the cut has only the weight 1 − γⁿ in the mean. So a critic whose error is the
-    same everywhere has this error as its bias.
+    same everywhere has this error as its bias. It is NaN where all costs are unknown.
 
-    Args:
-        value: Predictions for the steps of N rows, in order of time, [N, T, F].
-        cost: Costs of these steps, [N, T, F].
-        done: Whether an episode ends with a step, [N, T, 1] bool.
-        terminated: Whether it ends there by termination, not by a time-out, [N, T, 1] bool.
-        gamma: Discount γ per step.
-
-    Returns:
-        The bias, NaN where all costs are unknown.
+    Values and costs are those of N rows of steps, in order of time, [N, T, F]; ``done`` and
+    ``terminated`` (ends that are no time-outs) are [N, T, 1] bool.
     """
     ends = done.clone()
     ends[:, -1] = True
@@ -99,9 +92,7 @@ class CriticLoss(SharesTensors):
     target_cost_critic_params: TensorDictParams | None
 
     def __init__(
-        self,
-        critic: TensorDictModuleBase,
-        cost_critic: TensorDictModuleBase | None = None,
+        self, critic: TensorDictModuleBase, cost_critic: TensorDictModuleBase | None = None
     ) -> None:
         super().__init__()
         self.convert_to_functional(critic, "critic")

@@ -87,12 +87,9 @@ def normalise_advantages(
     by the mask of TorchRL's collectors, is ignored.
 
     Args:
-        tensordict: Batch of any shape.
+        tensordict: Batch of any shape, which is also returned.
         advantage: Key of the reward advantage, [..., 1].
         cost_advantage: Key of the cost advantages, [..., k], if there are any.
-
-    Returns:
-        The same TensorDict.
     """
     mask = sample_mask(tensordict)
     samples = ... if mask is None else mask

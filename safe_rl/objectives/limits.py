@@ -244,11 +244,7 @@ class LimitTracker(Checked, Resumable):
         self._is_shortened = shrinkage < 1
         self.decay, self.steps_per_decision = decay, steps_per_decision
         self.costs = EpisodeCosts(
-            num_costs,
-            max_length=max_length,
-            drift=drift,
-            decay=decay,
-            smallest=smallest_scale,
+            num_costs, max_length=max_length, drift=drift, decay=decay, smallest=smallest_scale
         )
         self.predictions = PredictedChange(num_costs, decay=decay, lowest=lowest_realised_share)
         self.integral, self.largest_integral = integral, largest_integral

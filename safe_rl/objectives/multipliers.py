@@ -93,14 +93,10 @@ class Multiplier(Checked, nn.Module, ABC):
 
     @torch.no_grad()
     def update(self, state: LimitState) -> None:
-        """Update λ after a batch.
+        """Update λ by what `safe_rl.algorithms.Constraints.update` or `LimitState.of` returns.
 
         If there is no new estimate of a cost (`is_new` is False, or its violation is NaN), the
         multiplier of this cost and its state do not change.
-
-        Args:
-            state: What `safe_rl.algorithms.Constraints.update` returns; in a loop without it,
-                `LimitState.of`.
 
         Raises:
             ValueError: If there is not one limit per cost.

@@ -76,9 +76,7 @@ class ReplayLoss(Checked, SharesTensors):
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Learn the scales of costs and rewards: call it with every batch, before its updates.
 
-        Args:
-            batch: New steps of the current policy, [N, T].
-            limits: State after this batch, as `safe_rl.algorithms.Constraints.update` returns it.
+        The batch has new steps of the current policy, [N, T]; `limits` is the state after it.
         """
 
     def cost_bias(self, batch: TensorDictBase) -> Tensor | None:
@@ -190,12 +188,7 @@ class QFunctionLoss(ReplayLoss):
         return network.values(entries, action, cache[name, kind])
 
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        """An entry below ``next`` that holds one number per step, [..., 1].
-
-        Raises:
-            KeyError: If there is no such entry.
-            ValueError: If it has another shape.
-        """
+        """An entry below ``next`` that holds one number per step, [..., 1]."""
         value = require(tensordict, ("next", key))
         expected = [*require(tensordict, self.tensor_keys.action).shape[:-1], 1]
         if list(value.shape) != expected:

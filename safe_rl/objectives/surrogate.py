@@ -76,10 +76,7 @@ class SurrogateLoss(Checked, SharesTensors):
     extra_out_keys: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        actor_network: ProbabilisticTensorDictSequential,
-        *,
-        entropy_coeff: NonNegativeFloat,
+        self, actor_network: ProbabilisticTensorDictSequential, *, entropy_coeff: NonNegativeFloat
     ) -> None:
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")

@@ -116,7 +116,7 @@ def test_a_checkpoint_of_before_the_first_update_is_whole(memory):
 
 
 def test_targets_that_would_never_move_and_other_losses_are_refused():
-    with pytest.raises(ValueError, match="tau is null, but SACLoss has target networks"):
+    with pytest.raises(ValueError, match="tau=None: SACLoss has target networks"):
         make_update(0, tau=None)
     cloning = BCLoss(make_bounded_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
     with pytest.raises(ValueError, match="BCLoss has no target networks: set it to null"):

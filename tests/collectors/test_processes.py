@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_rl.collectors.processes import starting_processes
+from safe_rl.collectors.workers import starting_processes
 
 pytestmark = pytest.mark.long
 
@@ -22,7 +22,7 @@ time.sleep(600)
 """
 CHILD = """
 import os, signal, sys, time
-from safe_rl.collectors.processes import end_with_parent
+from safe_rl.collectors.workers import end_with_parent
 signal.signal(signal.SIGTERM, lambda *_: print("told", flush=True))
 end_with_parent({grace})
 end_with_parent({grace})
@@ -51,7 +51,7 @@ def test_a_child_ends_soon_after_its_parent(ending, grace, last_words):
 DEAF = """
 import sys, time
 sys.stdin.readline()
-from safe_rl.collectors.processes import leave_signals_to_parent
+from safe_rl.collectors.workers import leave_signals_to_parent
 leave_signals_to_parent()
 print("begun", flush=True)
 time.sleep(600)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torch.distributions import Beta, Categorical, kl_divergence
+from torch.distributions import Categorical
 from torchrl.data import Binary, Bounded, MultiCategorical, OneHot
 from torchrl.data import Categorical as CategoricalSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -25,7 +25,7 @@ SPECS = {
     "gymnasium": Bounded(torch.zeros(7, 2), torch.tensor([2, 1]).expand(7, 2), dtype=torch.int64),
     "one_hot": OneHot(4, shape=(7, 4), dtype=torch.int64),
 }
-KINDS = [(spec, "auto") for spec in SPECS] + [("gaussian", "tanh"), ("gaussian", "beta")]
+KINDS = [(spec, "auto") for spec in SPECS] + [("gaussian", "tanh")]
 
 
 def make_actor(spec, kind):
@@ -88,30 +88,11 @@ def test_choices_that_there_are_not_are_never_taken():
     assert gradients.isfinite().all()
 
 
-def test_betas_are_torchs_between_bounds():
-    actor = make_actor("gaussian", "beta")
-    batch = observations()
-    parameters = actor.get_dist_params(batch)
-    reference = Beta(parameters["alpha"], parameters["beta"])
-    assert (torch.stack([parameters["alpha"], parameters["beta"]]) > 1).all()
-    distribution, width = actor.get_dist(batch), BOUNDS[1] - BOUNDS[0]
-    unit = torch.rand(7, 2)
-    found = distribution.log_prob(BOUNDS[0] + width * unit)
-    expected = (reference.log_prob(unit) - width.log()).sum(-1)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(distribution.mean, BOUNDS[0] + width * reference.mean)
-    same = kl_divergence(distribution, distribution)
-    torch.testing.assert_close(same, torch.zeros(7), atol=1e-5, rtol=0)
-    # what single precision rounds to the bounds has a density all the same
-    edges = distribution.log_prob(torch.stack([BOUNDS[0], BOUNDS[1]]).unsqueeze(1).expand(2, 7, 2))
-    assert edges.isfinite().all()
-
-
 @pytest.mark.parametrize(
     ("kind", "spec", "message"),
     [
-        ("beta", SPECS["categorical"], "model.head=beta is not for.*auto or categorical"),
-        ("categorical", SPECS["gaussian"], "auto or gaussian or tanh or beta"),
+        ("tanh", SPECS["categorical"], "model.head=tanh is not for.*auto or categorical"),
+        ("categorical", SPECS["gaussian"], "auto or gaussian or tanh"),
         ("auto", Binary(3, shape=(7, 3)), "No policy can act in Binary"),
         ("auto", Bounded(-1, 1, (7,)), r"act in BoundedContinuous\[7\]"),
         ("auto", OneHot(4, shape=(7, 2, 4)), r"act in OneHot\[7, 2, 4\]"),

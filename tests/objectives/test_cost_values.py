@@ -152,11 +152,6 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
         assert error == pytest.approx(distance, rel=1e-5)
 
 
-def test_a_mean_without_a_variance_is_refused():
-    with pytest.raises(ValueError, match=r"3 networks of cost critics, and GaussianCosts takes 2"):
-        make_loss(networks=3)
-
-
 def quantiles(number=10, tail=1.0, huber=1e-3):
     return QuantileCosts(number=number, tail=tail, huber=huber)
 
