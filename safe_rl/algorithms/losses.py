@@ -108,12 +108,6 @@ class LossState:
     Args:
         losses: Losses by name, see `PolicyUpdate.loss_modules`.
         saved_elsewhere: Modules that checkpoints save themselves; losses share their tensors.
-
-    Examples:
-        >>> loss = torch.nn.Module()
-        >>> loss.register_buffer("weight", torch.tensor(0.5))
-        >>> LossState({"loss": loss}, saved_elsewhere=[]).state_dict()
-        {'loss.weight': tensor(0.5000)}
     """
 
     def __init__(

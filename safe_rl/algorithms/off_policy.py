@@ -34,36 +34,23 @@ _ON_POLICY_ONLY = ("memory", "normalise")
 class OffPolicy(Resumable, Algorithm):
     """SAC, TD3 and similar algorithms.
 
-    Attributes:
-        policy: Exploring policy, with the actor's parameters.
-        networks: Actor, critic and, with constraints, cost critic.
-        constraints: Costs and limits.
-        multiplier: Multiplier that weighs costs against the return, or None. It follows the
-            undiscounted costs of episodes, not the discounted critics.
-        replay_buffer: The replay buffer.
-        policy_update: Trains all networks on minibatches.
-        random_steps: Environment steps with random actions at the beginning, 0 if nothing is
-            collected. Learning begins when the replay buffer holds as many steps.
-        steps_per_decision: Environment steps per transition.
-        collects: Whether collected transitions go into the replay buffer.
-        learns_from: A sentence on the dataset in the replay buffer, or a warning that nothing will
-            be learned.
-        steps: Environment steps so far.
+    The multiplier follows the undiscounted costs of episodes, not the discounted critics. Learning
+    begins when the replay buffer holds as many steps as the first, random ones.
     """
 
     state_names = ("steps", "constraints")
 
-    policy: ExploringPolicy
-    networks: Mapping[str, nn.Module]
+    policy: ExploringPolicy  # with the actor's parameters
+    networks: Mapping[str, nn.Module]  # actor, critic and, with constraints, cost critic
     constraints: Constraints
     multiplier: Multiplier | None
     replay_buffer: Memory
-    policy_update: ReplayUpdate
-    random_steps: int
-    steps_per_decision: int = 1
-    collects: bool = True
+    policy_update: ReplayUpdate  # trains all networks on minibatches
+    random_steps: int  # environment steps with random actions, 0 if nothing is collected
+    steps_per_decision: int = 1  # environment steps per transition
+    collects: bool = True  # whether collected transitions go into the replay buffer
     learns_from: str = ""
-    steps: int = 0
+    steps: int = 0  # environment steps so far
 
     def __post_init__(self) -> None:
         self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule

@@ -39,27 +39,17 @@ from safe_rl.trust import instantiate
 
 @dataclass
 class OnPolicy(Algorithm):
-    """PPO, TRPO, CPO and similar algorithms.
-
-    Attributes:
-        actor: Policy with ``get_dist``.
-        critic: Writes ``state_value``, [..., 1].
-        cost_critic: Writes ``cost_value``, [..., k]; None if the algorithm has no constraints.
-        constraints: Costs and limits.
-        multiplier: Multiplier that weighs costs against the return, or None.
-        advantage: Estimator of the reward advantage, with the critic.
-        cost_advantage: Estimator of the cost advantages, with the cost critic, or None.
-        policy_update: Improves the actor.
-        critic_update: Fits the critics.
-    """
+    """PPO, TRPO, CPO and similar algorithms."""
 
     actor: ProbabilisticTensorDictSequential
-    critic: TensorDictModule
-    cost_critic: TensorDictModule | None
+    critic: TensorDictModule  # writes ``state_value``, [..., 1]
+    cost_critic: (
+        TensorDictModule | None
+    )  # writes ``cost_value``, [..., k]; None without constraints
     constraints: Constraints
     multiplier: Multiplier | None
-    advantage: VectorGAE
-    cost_advantage: CostGAE | None
+    advantage: VectorGAE  # with the critic
+    cost_advantage: CostGAE | None  # with the cost critic
     policy_update: PolicyUpdate
     critic_update: PolicyUpdate
 

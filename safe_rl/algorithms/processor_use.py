@@ -35,12 +35,6 @@ def fast_products() -> Iterator[None]:
     microseconds longer to start, which is too much for the few rows of a policy that acts. Sums
     differ in their last digits. If ``torch.backends.mkldnn.matmul.fp32_precision`` has been set,
     this setting is kept.
-
-    Examples:
-        >>> with fast_products():
-        ...     product = torch.ones(300, 64) @ torch.ones(64, 64)
-        >>> product[0, 0].item()
-        64.0
     """
     products = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]  # made at run time
     before = products.fp32_precision

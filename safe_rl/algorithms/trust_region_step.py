@@ -44,18 +44,12 @@ def require_limits(limits: LimitState | None) -> LimitState:
 
 
 class Proposal(NamedTuple):
-    """A full step, and the conditions under which a line search may take it.
+    """A full step, and the conditions under which a line search may take it."""
 
-    Attributes:
-        step: Change of the parameters, [P].
-        is_acceptable: Tells whether the line search may take a step, from the losses and the KL
-            divergence after it. Only steps with a KL divergence of at most δ are passed.
-        diagnostics: Values to log about the step.
-    """
-
-    step: Tensor
+    step: Tensor  # change of the parameters, [P]
+    # of the losses and the KL divergence after a step, which is at most δ: whether to take the step
     is_acceptable: Callable[[TensorDictBase, Tensor], bool]
-    diagnostics: dict[str, Tensor]
+    diagnostics: dict[str, Tensor]  # values to log about the step
 
 
 class TRPOStep(PolicyUpdate):

@@ -16,19 +16,12 @@ from safe_rl.models.networks import InputScale, RunningScale, Tanh, input_scale_
 
 
 class Entry(NamedTuple):
-    """A tensor that is observed.
-
-    Attributes:
-        key: Key of the tensor.
-        name: Name of the component; "observation" if the observation is not nested.
-        shape: Shape in one environment: [n], [height, width, colours] or colours first.
-        is_bytes: Whether the numbers are integers from 0 to 255.
-    """
+    """A tensor that is observed."""
 
     key: NestedKey
-    name: str
-    shape: tuple[int, ...]
-    is_bytes: bool
+    name: str  # of the component; "observation" if the observation is not nested
+    shape: tuple[int, ...]  # of one environment: [n], [height, width, colours] or colours first
+    is_bytes: bool  # whether the numbers are integers from 0 to 255
 
     def __str__(self) -> str:
         return f"{self.name} {list(self.shape)}"
@@ -68,22 +61,14 @@ def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
 
 
 class Observed(NamedTuple):
-    """Properties of observations that networks depend on.
-
-    Attributes:
-        entries: The observed entries.
-        layouts: Key of a vector with several components -> component -> its columns.
-        input_scale: Component -> factor.
-        clip: Bound of columns normalised by running moments; None without normalisation.
-        encoders: Settings of the encoders of entries; None if the observation is one vector, which
-            needs no encoder.
-    """
+    """Properties of observations that networks depend on."""
 
     entries: Sequence[Entry]
+    # key of a vector with several components -> component -> its columns
     layouts: Mapping[str, Mapping[str, slice]]
-    input_scale: Mapping[str, float]
-    clip: float | None
-    encoders: Mapping[str, Any] | None
+    input_scale: Mapping[str, float]  # component -> factor
+    clip: float | None  # bound of columns normalised by running moments; None: not normalised
+    encoders: Mapping[str, Any] | None  # settings of each entry's encoder; None for one vector
 
     @property
     def keys(self) -> list[NestedKey]:

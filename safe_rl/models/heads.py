@@ -35,19 +35,12 @@ _NO_CHOICE = -1e9
 
 
 class Head(NamedTuple):
-    """How the outputs of a network become a distribution of actions.
+    """How the outputs of a network become a distribution of actions."""
 
-    Attributes:
-        num_outputs: Of the network.
-        parameters: Module from these, [..., num_outputs], to the distribution's parameters.
-        keys: Names of these parameters.
-        distribution: Class of the distribution, or a function that makes one.
-    """
-
-    num_outputs: int
-    parameters: nn.Module
-    keys: tuple[str, ...]
-    distribution: Callable[..., distributions.Distribution]
+    num_outputs: int  # of the network
+    parameters: nn.Module  # from these, [..., num_outputs], to the distribution's parameters
+    keys: tuple[str, ...]  # names of these parameters
+    distribution: Callable[..., distributions.Distribution]  # a class, or a function
 
 
 def make_head(

@@ -77,12 +77,6 @@ class EpisodeLengths(Resumable):
 
     Args:
         longest: Largest possible length of an episode in steps.
-
-    Examples:
-        >>> lengths = EpisodeLengths(1000)
-        >>> lengths.update(20_000, torch.full((400,), 50.0))
-        >>> lengths.mean
-        tensor(50.)
     """
 
     state_names = ("counts",)
@@ -126,13 +120,6 @@ class EpisodeCosts(Resumable):
 
     Attributes:
         lengths: Mean episode length T̄.
-
-    Examples:
-        >>> estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
-        >>> costs = torch.zeros(4, 200, 1)
-        >>> costs[:, ::50] = 1.0
-        >>> estimator.update(costs, torch.empty(0)).mean
-        tensor([20.])
     """
 
     state_names = ("_mean", "_error", "_sums", "_scatter", "lengths")

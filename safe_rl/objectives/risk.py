@@ -64,12 +64,7 @@ class RiskMeasure(Checked, Resumable, ABC):
 
 
 def value_at_risk(costs: Tensor, tail: float) -> Tensor:
-    """The cost that at most a fraction `tail` of the episodes exceeds: [E, k] -> [k].
-
-    Examples:
-        >>> value_at_risk(torch.tensor([[1.0], [2.0], [3.0], [4.0]]), tail=0.25)
-        tensor([3.])
-    """
+    """The cost that at most a fraction `tail` of the episodes exceeds: [E, k] -> [k]."""
     ranked = costs.sort(0, descending=True).values
     return ranked[min(int(tail * len(ranked)), len(ranked) - 1)]
 

@@ -190,15 +190,6 @@ class FisherProduct:
         batch: States to average over, any batch shape.
         parameters: θ, the parameters of the actor to differentiate by.
         damping: Multiple of the identity that is added.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from safe_rl.models import make_actor
-        >>> actor = make_actor(3, 2, hidden_sizes=[], initial_log_std=-0.5)
-        >>> batch = TensorDict(observation=torch.randn(8, 3), batch_size=[8])
-        >>> fisher = FisherProduct(actor, batch, list(actor.parameters()), damping=0.1)
-        >>> fisher(torch.ones(10)).shape
-        torch.Size([10])
     """
 
     def __init__(
