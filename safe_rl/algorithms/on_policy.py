@@ -45,7 +45,7 @@ class OnPolicy(Algorithm):
     critic: TensorDictModule  # writes ``state_value``, [..., 1]
     cost_critic: (
         TensorDictModule | None
-    )  # writes ``cost_value``, [..., k]; None without constraints
+    )  # writes ``cost_value``, [..., k]; or None
     constraints: Constraints
     multiplier: Multiplier | None
     advantage: VectorGAE  # with the critic
