@@ -43,9 +43,7 @@ class OnPolicy(Algorithm):
 
     actor: ProbabilisticTensorDictSequential
     critic: TensorDictModule  # writes ``state_value``, [..., 1]
-    cost_critic: (
-        TensorDictModule | None
-    )  # writes ``cost_value``, [..., k]; or None
+    cost_critic: TensorDictModule | None  # writes ``cost_value``, [..., k]; or None
     constraints: Constraints
     multiplier: Multiplier | None
     advantage: VectorGAE  # with the critic

@@ -18,21 +18,15 @@ from multiprocessing import active_children, connection, parent_process, resourc
 from multiprocessing.process import BaseProcess
 from threading import Thread
 from traceback import clear_frames
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-
-class MakeEnv(Protocol):
-    """Function, called in workers, that makes the run's environment with fewer rows."""
-
-    def __call__(self, *, num_envs: int) -> EnvBase:
-        """Make an environment of ``num_envs`` rows."""
-
-
+MakeEnv = Callable[..., EnvBase]
+"""Function of ``num_envs``, called in workers, that makes the run's environment with fewer rows."""
 Makers = list[Callable[[], EnvBase]]
 
 

@@ -19,11 +19,12 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import ValueEstimatorBase
 
 from safe_rl.checks import Checked, Share
-from safe_rl.objectives.gae import gae, normalise_advantages, one_pass_values, trajectory_ends
-from safe_rl.objectives.samples import require, sample_mask
+from safe_rl.objectives.gae import gae, normalise_advantages, trajectory_ends
+from safe_rl.objectives.samples import FIRST, require, sample_mask
 
 ValueTarget = Literal["lambda_return", "return_to_go"]
 
@@ -191,13 +192,28 @@ class VectorGAE(Checked, ValueEstimatorBase):
     def _values(
         self, tensordict: TensorDictBase, ends: Tensor, params: TensorDictBase | None
     ) -> tuple[Tensor, Tensor]:
+        """Values of the observations and of the next observations, both [..., T, F].
+
+        Inside a trajectory the next observation of step t is the root observation of step t + 1. So
+        only the last observations of trajectories, where `ends` is set, are evaluated in addition.
+        A recurrent network reads the rollout as sequences, and the last observations as sequences
+        of one step with their recurrent states.
+        """
         key, network = self.tensor_keys.value, self.value_network
         if network is None:
             hint = "With value_network=None the values must be there before."
             following = require(tensordict, ("next", key), hint)
             return require(tensordict, key, hint), following
-        with nullcontext() if params is None else params.to_module(network):
-            return one_pass_values(tensordict, network, key, ends)
+        last = tensordict.get("next").select(*network.in_keys)[ends]
+        if FIRST in network.in_keys:
+            last = last.unsqueeze(-1)
+        own = nullcontext() if params is None else params.to_module(network)
+        with own, set_recurrent_mode(True):
+            value = require(network(tensordict.select(*network.in_keys)), key)
+            value_at_ends = network(last).get(key)
+        next_value = value.roll(-1, dims=-2)
+        next_value[ends] = value_at_ends.reshape(-1, value.shape[-1])
+        return value, next_value
 
 
 class CostGAE(VectorGAE):

@@ -1,15 +1,13 @@
-"""Parts of advantage estimators: ends of trajectories, values, estimates and normalisation."""
+"""Parts of advantage estimators: ends of trajectories, estimates and normalisation."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
 
-from safe_rl.objectives.samples import FIRST, require, sample_mask
+from safe_rl.objectives.samples import require, sample_mask
 
 
 def trajectory_ends(done: Tensor, mask: Tensor | None, ids: Tensor | None) -> Tensor:
@@ -25,31 +23,6 @@ def trajectory_ends(done: Tensor, mask: Tensor | None, ids: Tensor | None) -> Te
         ids = ids.reshape(ends.shape)
         ends |= ids != ids.roll(-1, -1)
     return ends if mask is None else (ends | ~mask.roll(-1, -1)) & mask
-
-
-def one_pass_values(
-    tensordict: TensorDictBase, value_network: TensorDictModuleBase, key: NestedKey, ends: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Evaluate every observation of a rollout once.
-
-    Inside a trajectory the next observation of step t is the root observation of step t + 1. So
-    only the last observations of trajectories, where `ends` is set, are evaluated in addition. A
-    recurrent network reads the rollout as sequences, and the last observations as sequences of one
-    step with their recurrent states.
-
-    Returns:
-        Values of the root observations and of the next observations, both [..., T, F].
-    """
-    in_keys = value_network.in_keys
-    last = tensordict.get("next").select(*in_keys)[ends]
-    if FIRST in in_keys:
-        last = last.unsqueeze(-1)
-    with set_recurrent_mode(True):
-        value = require(value_network(tensordict.select(*in_keys)), key)
-        value_at_ends = value_network(last).get(key)
-    next_value = value.roll(-1, dims=-2)
-    next_value[ends] = value_at_ends.reshape(-1, value.shape[-1])
-    return value, next_value
 
 
 def gae(
