@@ -20,7 +20,7 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.models import ExploringPolicy, QEnsemble
-from safe_rl.models.encoders import Codes, Observed, observed_by, observed_entries
+from safe_rl.models.build_networks import Codes, Observed, observed_by, observed_entries
 from safe_rl.models.replay_networks import bounded_actions
 from safe_rl.objectives import CostValues, MeanCosts, Multiplier
 from safe_rl.objectives.q_functions import ReplayLoss

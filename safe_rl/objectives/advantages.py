@@ -26,8 +26,6 @@ from safe_rl.checks import Checked, Share
 from safe_rl.objectives.gae import gae, normalise_advantages, trajectory_ends
 from safe_rl.objectives.samples import FIRST, require, sample_mask
 
-ValueTarget = Literal["lambda_return", "return_to_go"]
-
 
 class VectorGAE(Checked, ValueEstimatorBase):
     """Advantages and value targets of one or several reward-like signals.
@@ -47,16 +45,10 @@ class VectorGAE(Checked, ValueEstimatorBase):
             there unless it terminated).
 
     Examples:
-        >>> from tensordict import TensorDict
         >>> from safe_rl.models import make_critic
         >>> settings = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
-        >>> estimator = VectorGAE(make_critic(3, hidden_sizes=[8]), **settings)
-        >>> seen, goes_on = torch.randn(2, 10, 3), torch.zeros(2, 10, 1, dtype=torch.bool)
-        >>> next = {"observation": seen, "reward": seen[..., :1], "done": goes_on}
-        >>> next["terminated"] = goes_on
-        >>> rollout = TensorDict(observation=seen, next=next, batch_size=[2, 10])
-        >>> estimator(rollout)["advantage"].shape
-        torch.Size([2, 10, 1])
+        >>> VectorGAE(make_critic(3, hidden_sizes=[8]), **settings).in_keys[:3]
+        ['observation', ('next', 'observation'), ('next', 'reward')]
     """
 
     @dataclass
@@ -78,7 +70,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         *,
         gamma: Share,
         lmbda: Share,
-        value_target: ValueTarget,
+        value_target: Literal["lambda_return", "return_to_go"],
     ) -> None:
         super().__init__(value_network=value_network)
         self.gamma, self.lmbda, self.value_target = gamma, lmbda, value_target
@@ -133,10 +125,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         next_value: Tensor | None = None,
         **kwargs: Any,
     ) -> Tensor:
-        """The value targets alone, [..., T, F]; the rollout stays as it is.
-
-        Values of the next observations, [..., T, F], can be given instead of the network's.
-        """
+        """The value targets alone, [..., T, F]; `next_value` [..., T, F] replaces the network's."""
         return self._estimate(tensordict, None, next_value, target_params)[-1]
 
     def _estimate(

@@ -57,12 +57,8 @@ def normalise_advantages(
 
     Cost advantages are never rescaled. A multiplier depends on their size relative to the
     standardised reward advantage, and in CPO they must have the units of the constraint. Padding,
-    by the mask of TorchRL's collectors, is ignored.
-
-    Args:
-        tensordict: Batch of any shape, which is also returned.
-        advantage: Key of the reward advantage, [..., 1].
-        cost_advantage: Key of the cost advantages, [..., k], if there are any.
+    by the mask of TorchRL's collectors, is ignored. The batch, which is returned, has any shape;
+    advantages are [..., 1] of the reward, and [..., k] of costs, if there are any.
     """
     mask = sample_mask(tensordict)
     samples = ... if mask is None else mask
