@@ -132,13 +132,8 @@ def nearest_feasible(excess: Tensor, gram: Tensor) -> Tensor:
     The nearest point to x₀ is x₀ − Σᵢ νᵢ L⁻¹bᵢ, where ν ≥ 0 minimises ½ νᵀSν − νᵀe with
     e = b x₀ + c and Sᵢⱼ = bᵢᵀL⁻¹bⱼ. For one half-space, ν = max(0, e/s). It is solved as a problem
     of least distance (Lawson and Hanson 1974, section 23.4), also if the bᵢ depend on each other.
-
-    Args:
-        excess: e, [k].
-        gram: S, [k, k]; positive semi-definite. Constraints without a gradient are left out.
-
-    Returns:
-        ν, [k]; 0 if no point is in all half-spaces.
+    Constraints without a gradient are left out. ν, [k], is 0 if no point is in all half-spaces;
+    `excess` is e, [k], and `gram` S, [k, k].
     """
     lengths = gram.double().diagonal().clamp_min(0).sqrt()
     scale = torch.where(lengths > 1e-8, 1 / lengths, 0.0)

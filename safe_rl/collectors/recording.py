@@ -39,18 +39,11 @@ def match_columns(
 ) -> list[int]:
     """Where in other columns the columns of an environment are, by their names.
 
-    Args:
-        columns: Names of the other columns, of unknown origin.
-        wanted: ``column_names`` of the environment.
-        sensors: ``sensor_keys`` of the other columns; None: unknown.
-        of_env: ``sensor_keys`` of the environment.
+    `columns` are the other names, of unknown origin, and `wanted` the environment's
+    ``column_names``; `sensors` and `of_env` are the ``sensor_keys`` of both, None if unknown.
 
     Raises:
         ValueError: If names or keys differ; the message says which.
-
-    Examples:
-        >>> match_columns(["speed", "place"], ["place", "speed"])
-        [1, 0]
     """
     if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
         raise ValueError("their columns are not a list of names")
