@@ -19,6 +19,12 @@ TRUST_REGION = {
     "max_backtracks": 10,
 }  # fmt: skip
 
+LIMITS = {
+    "margin": 0.5, "largest_margin": 0.2, "latest_end": 0.7, "smallest_scale": 0.01, "drift": 0.2,
+    "decay": 0.9, "lowest_realised_share": 0.1, "integral": 0.0, "largest_integral": 0.5,
+}  # fmt: skip
+"""Settings of a `LimitTracker` but for those in steps."""
+
 
 def make_actor(
     in_key="observation", loc="loc", scale="scale", action="action", width=8,

@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 import torch
-from samples import make_actor, make_critic
+from samples import LIMITS, make_actor, make_critic
 from tensordict import TensorDict
 
 from safe_rl.algorithms import MinibatchUpdate, OnPolicy
@@ -20,11 +20,7 @@ from safe_rl.objectives import (
 )
 
 SETTINGS = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
-TRACKER = {
-    "max_length": 5, "margin": 0.5, "largest_margin": 0.2, "free_steps": 0, "descent_steps": 100,
-    "frames": 1000, "latest_end": 0.7, "smallest_scale": 0.01, "drift": 0.2, "decay": 0.9,
-    "lowest_realised_share": 0.1, "integral": 0.0, "largest_integral": 0.5,
-}  # fmt: skip
+TRACKER = LIMITS | {"max_length": 5, "free_steps": 0, "descent_steps": 100, "frames": 1000}
 WRITTEN = {
     "actor": {"action": "action", "log_prob": "action_log_prob"},
     "critic": {"out_key": "state_value"},

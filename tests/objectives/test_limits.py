@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from samples import make_actor, make_batch
+from samples import LIMITS, make_actor, make_batch
 from tensordict import TensorDict
 
 from safe_rl.algorithms import Constraints
@@ -10,25 +10,11 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.objectives import PIDMultiplier, PIMultiplier, ProjectedMultiplier, RCPOLoss
 from safe_rl.objectives.limits import LimitState, LimitTracker, PredictedChange
 
-SETTINGS = {
-    "max_length": 1000,
-    "margin": 0.5,
-    "largest_margin": 0.2,
-    "free_steps": 4_000,
-    "descent_steps": 10_000,
-    "frames": 1_000_000,
-    "latest_end": 0.7,
-    "smallest_scale": 0.01,
-    "drift": 0.2,
-    "decay": 0.9,
-    "lowest_realised_share": 0.1,
-    "integral": 0.0,
-    "largest_integral": 0.5,
-}
+STEPS = {"max_length": 1000, "free_steps": 4_000, "descent_steps": 10_000, "frames": 1_000_000}
 
 
 def tracker(*limits: float, **settings) -> LimitTracker:
-    return LimitTracker(torch.tensor(limits or (25.0,)), **SETTINGS | settings)
+    return LimitTracker(torch.tensor(limits or (25.0,)), **LIMITS | STEPS | settings)
 
 
 def batches(number: int, rate: float, seed: int = 0, unit: float = 1.0) -> list[torch.Tensor]:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from point_mass import PointMass
-from samples import limit_state
+from samples import TRUST_REGION, limit_state
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     ProbabilisticTensorDictModule,
@@ -93,14 +93,8 @@ def sequence_kl(actor, batch):
 def test_the_trust_region_is_that_of_sequences(collected):
     actor, _, batch = collected
     batch["advantage"] = torch.randn(4, 50, 1)
-    step = TRPOStep(
-        TRPOLoss(actor, entropy_coeff=0.0),
-        target_kl=0.05,
-        damping=1e-3,
-        cg_iterations=20,
-        backtrack_coeff=0.8,
-        max_backtracks=10,
-    )
+    settings = TRUST_REGION | {"target_kl": 0.05, "damping": 1e-3, "cg_iterations": 20}
+    step = TRPOStep(TRPOLoss(actor, entropy_coeff=0.0), **settings)
     kl = step(batch)["kl"]
     assert kl > 0.02
     torch.testing.assert_close(sequence_kl(actor, batch), kl)

@@ -5,8 +5,7 @@ import shutil
 
 import pytest
 import torch
-from point_mass import PointMass
-from point_mass_runs import point_mass_trainer
+from point_mass_runs import point_mass_trainer, trainer_of
 from run_configs import off_policy_config
 from torchrl.checkpoint import CheckpointError
 
@@ -14,7 +13,6 @@ from safe_rl.evaluation.loading import load_policy
 from safe_rl.files import load_tensors, save_tensors
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.run import Run
-from safe_rl.training.building import build_trainer, seed_everything
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +39,7 @@ def off_policy(tmp_path_factory):
     """A run with a replay buffer of transitions over three steps, and the trainer of it."""
     folder = tmp_path_factory.mktemp("off_policy") / "run"
     config = off_policy_config("algo=sac_lagrangian", "memory.n_steps=3", "frames=320")
-    seed_everything(0, 1)
-    trainer = build_trainer(config, PointMass(4, 20), folder)
+    trainer = trainer_of(config, folder)
     trainer.run()
     return folder, trainer
 

@@ -3,20 +3,16 @@
 import sys
 
 import pytest
-from point_mass import PointMass
-from run_configs import point_mass_config
+from point_mass_runs import point_mass_trainer
 
 from safe_rl.checks import SettingError
 from safe_rl.runs.loggers import WandbLogger
 from safe_rl.runs.table import read_table
-from safe_rl.training.building import build_trainer, seed_everything
 from safe_rl.trust import allow
 
 
 def train(directory, *overrides):
-    config = point_mass_config(*overrides)
-    seed_everything(config.seed, 1)
-    trainer = build_trainer(config, PointMass(config.num_envs, 20), directory)
+    trainer = point_mass_trainer(directory, *overrides)
     if trainer.writer.run.has_begun:
         trainer.resume()
     trainer.run()

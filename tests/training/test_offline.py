@@ -1,12 +1,16 @@
 """Learning from a dataset: what is taken of it, what is cloned, and what does not fit."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from point_mass import Forgetful, PointMass
+from point_mass_runs import trainer_of
 from run_configs import assert_resumes_exactly, compose_config
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.data import Composite, Unbounded
 
 from safe_rl.algorithms import OffPolicy
 from safe_rl.collectors import Recording, make_collector, read_recording, safe_episodes
@@ -14,7 +18,6 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.models import make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import BCLoss
 from safe_rl.runs.table import read_table
-from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
 
@@ -59,15 +62,10 @@ def recorded_config(*overrides):
     )
 
 
-def make_trainer(config, directory):
-    seed_everything(config.seed, None)
-    return build_trainer(config, PointMass(config.num_envs, 20, config.seed), directory)
-
-
 def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     data = record(tmp_path / "data", head_north, head_south)
     (tmp_path / "config.yaml").write_text("env: {name: CarGoal1}")
-    trainer = make_trainer(offline_config(data), tmp_path / "run")
+    trainer = trainer_of(offline_config(data), tmp_path / "run")
     assert trainer.algorithm.learns_from == (
         f"Learning from 160 of 320 transitions in {data}: those of whole episodes that keep the "
         "limits. Warning: they are of CarGoal1, and this environment is PointMass."
@@ -88,20 +86,20 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
 
 def test_it_resumes_as_if_it_had_never_stopped(tmp_path):
     data = record(tmp_path / "data", head_south)
-    make = lambda name, *first: make_trainer(offline_config(data, *first), tmp_path / name)  # noqa: E731
+    make = lambda name, *first: trainer_of(offline_config(data, *first), tmp_path / name)  # noqa: E731
     assert assert_resumes_exactly(make, tmp_path, "frames=640").algorithm.lost_on_resume == ""
 
 
 @pytest.mark.parametrize("algo", ["ppo_lagrangian", "sac_lagrangian"])
 def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
-    trainer = make_trainer(recorded_config(f"algo={algo}", "frames=480"), tmp_path / "run")
+    trainer = trainer_of(recorded_config(f"algo={algo}", "frames=480"), tmp_path / "run")
     collected, update = [], trainer.accounting.update
     trainer.accounting.update = lambda batch: (collected.append(batch.clone()), update(batch))[1]
     trainer.run()
     found, expected = read_recording(tmp_path / "run" / "transitions"), torch.cat(collected, -1)
     for key in (*("observation", "action"), *(("next", k) for k in ("reward", "cost", "done"))):
         assert torch.equal(found[key], expected[key])
-    clone = make_trainer(
+    clone = trainer_of(
         offline_config(tmp_path / "run" / "transitions", "frames=160", limits="{cost: 25}"),
         tmp_path / "clone",
     )
@@ -113,8 +111,8 @@ def test_a_run_that_is_recorded_can_be_learned_from(algo, tmp_path):
 
 
 def test_a_resumed_run_records_again_what_it_repeats(tmp_path):
-    make_trainer(recorded_config("frames=480"), tmp_path / "whole").run()
-    make_trainer(recorded_config("frames=160"), tmp_path / "halves").run()
+    trainer_of(recorded_config("frames=480"), tmp_path / "whole").run()
+    trainer_of(recorded_config("frames=160"), tmp_path / "halves").run()
     # of a process that was killed before it could write a checkpoint, and was to be a longer run
     ahead = tmp_path / "halves" / "transitions"
     for number in (1, 2, 3):
@@ -124,7 +122,7 @@ def test_a_resumed_run_records_again_what_it_repeats(tmp_path):
                 "observation", "reward", "done", "terminated", "truncated",
             )},
         ))  # fmt: skip
-    resumed = make_trainer(recorded_config("frames=480"), tmp_path / "halves")
+    resumed = trainer_of(recorded_config("frames=480"), tmp_path / "halves")
     assert resumed.resume()
     resumed.run()
     whole, halves = (read_recording(tmp_path / n / "transitions") for n in ("whole", "halves"))
@@ -139,8 +137,7 @@ def test_whole_episodes_of_a_recording_are_those_of_the_table(kind, staggered, t
     def build(frames):
         keys = [f"frames={frames}", "frames_per_batch=200", f"staggered_starts={staggered}"]
         config = recorded_config(*keys)
-        seed_everything(config.seed, None)
-        return build_trainer(config, kind(4, 20, config.seed), tmp_path)
+        return trainer_of(config, tmp_path, kind(4, 20, config.seed))
 
     build(600).run()
     resumed = build(1200)
@@ -161,7 +158,7 @@ def test_recording_may_begin_within_episodes(tmp_path):
 
     def build(frames, record):
         keys = [f"frames={frames}", f"record={record}", "frames_per_batch=200"]
-        return make_trainer(recorded_config(*keys, "staggered_starts=null"), tmp_path)
+        return trainer_of(recorded_config(*keys, "staggered_starts=null"), tmp_path)
 
     build(200, "false").run()
     resumed = build(600, "true")
@@ -176,7 +173,7 @@ def test_recording_may_begin_within_episodes(tmp_path):
 def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     data = record(tmp_path / "data", head_north, head_south)
     keys = ["exploration.random_steps=0", "policy_update.updates_per_step=0.05", "memory.n_steps=3"]
-    trainer = make_trainer(offline_config(data, *keys, algo="sac"), tmp_path / "run")
+    trainer = trainer_of(offline_config(data, *keys, algo="sac"), tmp_path / "run")
     assert len(trainer.algorithm.replay_buffer) == 320
     before = len(trainer.algorithm.replay_buffer)
     trainer.epoch(iter(trainer.collector))
@@ -185,7 +182,7 @@ def test_any_algorithm_may_begin_with_a_dataset(tmp_path):
     assert "dataset alone" in trainer.algorithm.lost_on_resume
     # with nothing of its own to learn from, nothing is done at random
     keys += ["dataset.alone=true", "exploration.random_steps=10000"]
-    alone = make_trainer(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "alone")
+    alone = trainer_of(offline_config(data, *keys, algo="sac_lagrangian"), tmp_path / "alone")
     assert not alone.algorithm.policy.is_random
     assert alone.algorithm.lost_on_resume == ""
     assert alone.epoch(iter(alone.collector))["policy_num_updates"] == 8
@@ -236,24 +233,12 @@ def test_wrong_numbers_are_refused(algo, key, value, tmp_path):
         )
 
 
-class Wider(PointMass):
-    """Of another kind: five numbers are observed."""
+class Other(PointMass):
+    """Of another kind: five numbers are observed, or a picture."""
 
-    def __init__(self):
+    def __init__(self, *shape):
         super().__init__(2)
-        spec = self.observation_spec
-        spec["observation"] = type(spec["observation"])((2, 5))
-        self.observation_spec = spec
-
-
-class Filmed(PointMass):
-    """Of another kind: a picture is observed."""
-
-    def __init__(self):
-        super().__init__(2)
-        spec = self.observation_spec
-        spec["observation"] = type(spec["observation"])((2, 40, 40, 3))
-        self.observation_spec = spec
+        self.observation_spec = Composite(observation=Unbounded((2, *shape)), shape=[2])
 
 
 @pytest.mark.parametrize(
@@ -263,8 +248,8 @@ class Filmed(PointMass):
         (["dataset.path=/no/where"], PointMass, "/no/where: there is no such recording"),
         (["+limit=0"], PointMass, "of its 160 transitions 0 are taken in whole"),
         (["memory.capacity=80"], PointMass, "room for them: memory.capacity=80"),
-        ([], Wider, "its observations are 4 numbers, those of this environment 5"),
-        (["model=cnn"], Filmed, "has vectors as observations, and this environment has others"),
+        ([], partial(Other, 5), "its observations are 4 numbers, those of this environment 5"),
+        (["model=cnn"], partial(Other, 40, 40, 3), "has vectors as observations, and this env"),
     ],
 )
 def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):
