@@ -1,8 +1,7 @@
 """Every algorithm on a problem whose optimal constrained policy is known in closed form."""
 
-from itertools import count
-
 import pytest
+import samples
 import torch
 from cmdp import ONE, STEPS, TARGET, TWO, make_actor, train
 from tabular import ONE_OF_THREE, TWO_COMPONENTS
@@ -14,7 +13,6 @@ from safe_rl.objectives import (
     CUPLoss,
     FOCOPSLoss,
     IPOLoss,
-    LagrangeMultiplier,
     LimitState,
     P3OLoss,
     PIDMultiplier,
@@ -29,10 +27,7 @@ from safe_rl.objectives import (
 pytestmark = pytest.mark.long
 
 TARGET_KL = 0.1
-TRUST_REGION = {
-    "target_kl": 0.03, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8,
-    "max_backtracks": 10,
-}  # fmt: skip
+TRUST_REGION = samples.TRUST_REGION | {"target_kl": 0.03, "cg_iterations": 10}
 PPO = {"clip_epsilon": 0.2, "entropy_coeff": 0.0}
 
 
@@ -66,25 +61,9 @@ def multiplier_first(multiplier, update):
     return update_both
 
 
-def dual_ascent(multiplier, update):
-    """`multiplier_first` with dual step sizes that fall as 1/t, so that λ settles."""
-    first_lr, epochs = multiplier.lr, count(1)
-
-    def update_both(batch, mean_costs):
-        multiplier.lr = first_lr / (1 + next(epochs) / 50)
-        multiplier_first(multiplier, update)(batch, mean_costs)
-
-    return update_both
-
-
 def ppo(actor, cmdp):
     update = ppo_update(PPOLoss(actor, **PPO), actor)
     return lambda batch, _mean_costs: update(batch)
-
-
-def ppo_lagrangian(actor, cmdp):
-    multiplier = LagrangeMultiplier(cmdp.cost_limits, init=1.0, lr=0.08)
-    return dual_ascent(multiplier, ppo_update(PPOLagrangianLoss(actor, multiplier, **PPO), actor))
 
 
 def pid_multiplier(cmdp):
@@ -183,9 +162,7 @@ def cup(actor, cmdp):
 
 
 UNCONSTRAINED = [ppo, trpo]
-# Epochs: a multiplier moved by gradient steps overshoots before it settles, a controller does not.
 CONSTRAINED = [
-    (ppo_lagrangian, 250),
     (ppo_pid, 120),
     (trpo_pid, 120),
     (cpo, 100),
