@@ -1,10 +1,12 @@
 """A run from its beginning to its certificate: what stops it, what continues it, what is left."""
 
 import os
+import shutil
 import signal
 
 import pytest
 import torch
+from commands import SMALL
 from run_configs import compose_config, without_times
 
 from safe_rl.cli.sweeps import run_job
@@ -14,15 +16,26 @@ from safe_rl.runs.run import Run
 from safe_rl.training.train import is_expected, train
 from safe_rl.training.trainer import Trainer
 
-SMALL = (
-    *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "frames=80", "logger=none"),
-    *("model.hidden_sizes=[8]", "critic_update.minibatch_size=20", "num_threads=1"),
+TINY = (
+    *(*SMALL, "frames=80", "policy_update.minibatch_size=20", "critic_update.minibatch_size=20"),
     *("certificate.ranking=2", "certificate.episodes=4", "certificate.tests=1"),
 )
 
 
 def small(*overrides):
-    return compose_config(*SMALL, "policy_update.minibatch_size=20", *overrides)
+    return compose_config(*TINY, *overrides)
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    """A finished run that has not been certified."""
+    return train(small("certificate.episodes=0"), tmp_path_factory.mktemp("usual") / "run")
+
+
+@pytest.fixture
+def run(usual, tmp_path):
+    """A copy of it."""
+    return Run(shutil.copytree(usual.directory, tmp_path / "run"))
 
 
 def stop_in(epoch):
@@ -93,8 +106,7 @@ def test_a_finished_run_is_judged_by_the_episodes_of_its_environment(tmp_path, m
     assert tested == [tmp_path / "run"]
 
 
-def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
-    run = train(small("certificate.episodes=0"), tmp_path / "run")
+def test_a_certificate_needs_the_folder_for_itself(run, monkeypatch):
     monkeypatch.setattr(
         certifying, "certify", lambda *_, **__: pytest.fail("tested without the lock")
     )
@@ -114,15 +126,13 @@ def test_a_certificate_needs_the_folder_for_itself(tmp_path, monkeypatch):
         os.waitpid(child, 0)
 
 
-def test_a_notebook_without_gradients_trains_as_usual(tmp_path):
-    usual = train(small("certificate.episodes=0"), tmp_path / "usual")
+def test_a_notebook_without_gradients_trains_as_usual(usual, tmp_path):
     with torch.no_grad():
         run = train(small("certificate.episodes=0"), tmp_path / "run")
     assert without_times(run.table_file) == without_times(usual.table_file)
 
 
-def test_what_a_killed_process_left_is_removed(tmp_path):
-    run = train(small("certificate.episodes=0"), tmp_path / "run")
+def test_what_a_killed_process_left_is_removed(run):
     mark = "0123456789abcdef"
     left = [run.directory / f".config.{mark}.yaml", run.directory / f".curves.{mark}.png"]
     left.append(run.checkpoints_folder / "last" / f".checkpoint-000000000040.{mark}.torchrl")
@@ -144,13 +154,7 @@ def test_a_run_that_cannot_begin_leaves_no_folder(tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_an_error_of_training_that_no_setting_explains_keeps_its_traceback(tmp_path):
-    def fail(row):
-        raise ValueError("in a callback")
-
-    with pytest.raises(ValueError, match="in a callback") as caught:
-        train(small(), tmp_path / "run", callbacks=[fail])
-    assert not is_expected(caught.value)
+def test_a_run_in_the_place_of_another_is_refused_in_a_line(usual):
     with pytest.raises(FileExistsError) as caught:
-        train(small(), tmp_path / "run")
+        train(small(), usual.directory)
     assert is_expected(caught.value)
