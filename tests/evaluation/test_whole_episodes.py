@@ -7,11 +7,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from point_mass import PointMass
 from torchrl.envs import DeviceCastTransform, TransformedEnv
 
-from safe_rl.envs import ConstrainedEnv
 from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation import video
 from safe_rl.evaluation.episodes import (
@@ -29,51 +27,24 @@ FILM = {"deterministic": True, "form": FORMATS["mp4"]}
 
 
 def small_policy():
-    return BehaviourPolicy(make_actor(1, 1, hidden_sizes=[4], initial_log_std=0.0))
+    return BehaviourPolicy(make_actor(4, 2, hidden_sizes=[4], initial_log_std=0.0))
 
 
-class KnownLengths(ConstrainedEnv):
+class KnownLengths(PointMass):
     """The reward of a step is 1, its cost 0.5."""
 
-    cost_keys = ["cost"]  # noqa: RUF012
-
     def __init__(self, lengths=LENGTHS):
-        num = self.num = len(lengths)
-        super().__init__(batch_size=[num])
-        self.observation_spec = Composite(observation=Unbounded((num, 1)), shape=[num])
-        self.action_spec = Bounded(-1, 1, (num, 1))
-        keys = {key: Unbounded((num, 1)) for key in ("reward", "cost")}
-        self.full_reward_spec = Composite(**keys, shape=[num])
-        flags = ("done", "terminated", "truncated")
-        self.full_done_spec = Composite(
-            **{key: Categorical(2, dtype=torch.bool, shape=(num, 1)) for key in flags}, shape=[num]
-        )
         self._lengths = torch.tensor(lengths)
-        self._episode = torch.full((num,), -1)
-        self._step_count = torch.zeros(num, dtype=torch.long)
+        super().__init__(len(lengths), self._lengths.max().item())
 
-    def _set_seed(self, seed):
-        pass
-
-    def _reset(self, tensordict=None, **kwargs):
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(self.num, dtype=torch.bool) if mask is None else mask.flatten().cpu()
-        self._episode = self._episode + mask
-        self._step_count = torch.where(mask, 0, self._step_count)
-        return self._output(torch.zeros(self.num, 1, dtype=torch.bool))
-
-    def _output(self, done):
-        return TensorDict(
-            observation=torch.zeros(self.num, 1), done=done, terminated=done.clone(),
-            truncated=torch.zeros_like(done), batch_size=[self.num],
-        )  # fmt: skip
+    def _reset(self, tensordict=None, **kwargs):  # its tensors stay on the CPU
+        return super()._reset(None if tensordict is None else tensordict.cpu(), **kwargs)
 
     def _step(self, tensordict):
-        self._step_count = self._step_count + 1
-        length = self._lengths[torch.arange(self.num), self._episode % 2]
-        out = self._output((self._step_count >= length).unsqueeze(-1))
-        out["reward"], out["cost"] = torch.ones(self.num, 1), torch.full((self.num, 1), 0.5)
-        return out
+        step = super()._step(tensordict)
+        over = self._step_count >= self._lengths.gather(1, (self._episode.long() - 1) % 2)
+        ends = {"done": over, "terminated": over.clone(), "truncated": over & False}
+        return step.update({"reward": over * 0.0 + 1, "cost": over * 0.0 + 0.5, **ends})
 
 
 @pytest.mark.parametrize(
@@ -95,8 +66,6 @@ def test_every_world_contributes_its_first_episodes(number, expected):
 class Shaped(KnownLengths):
     """Learning sees another reward than the one that returns are made of."""
 
-    max_episode_steps = 2
-    observation_layout = {"observation": slice(0, 1)}  # noqa: RUF012
     return_key = "score"
 
     def __init__(self, lengths):
@@ -205,7 +174,7 @@ def test_layouts_without_a_range_are_known_where_they_are_fixed_and_the_seed_is_
 
 
 def make_evaluation(make, device="cpu", **keys):
-    actor = make_actor(1, 1, hidden_sizes=[4], initial_log_std=-0.5, device=device)
+    actor = make_actor(4, 2, hidden_sizes=[4], initial_log_std=-0.5, device=device)
     policy = BehaviourPolicy(actor)
     return periodic_evaluation(make, policy, ["cost"], interval=100, episodes=3, seed=7, **keys)
 
@@ -230,7 +199,7 @@ def test_evaluations_in_between_leave_the_draws_of_training_alone_whatever_seedi
             torch.manual_seed(seed)
 
     def make(*, num_envs, seed):
-        env = Seeding([[2, 2]] * num_envs)  # its tensors stay on the CPU
+        env = Seeding([[2, 2]] * num_envs)
         env.set_seed(seed)
         return TransformedEnv(env, DeviceCastTransform(device, orig_device="cpu"))
 
