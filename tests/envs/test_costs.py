@@ -31,33 +31,23 @@ def positive(got) -> set[str]:
 VASES = {**FROZEN, "vases_num": 2, "vases_displace_cost": 2.0, "vases_velocity_cost": 3.0}
 
 
-def moved_vase(env, offset: tuple[float, float], velocity: tuple[float, float, float]):
-    """Two vases; the first was moved since the reset, and moves."""
+def moved_vase(env, *offset: float):
+    """Two vases at rest; the first was moved since the reset."""
     state = arrange(env, robot=(-3, 0, 0), vase0=(0, 0, 0), vase1=(1, 0, 0))
     first = position_columns(env)["vase0"]
     state["qpos"][:, first] += torch.tensor(offset, dtype=torch.float64)
-    state["qvel"][:, 3:6] = torch.tensor(velocity, dtype=torch.float64)
     return state
 
 
 def test_displaced_vases_cost_their_distance_in_the_plane():
     env = make(VASES)
-    got = costs(step_from(env, moved_vase(env, (0.3, 0.4), (0, 0, 0)), 0, 0))
+    got = costs(step_from(env, moved_vase(env, 0.3, 0.4), 0, 0))
     assert math.isclose(got["cost_vases_displace"], 2 * 0.5, rel_tol=1e-6)
     assert got["cost_vases_contact"] == got["cost_vases_velocity"] == 0
-    below = step_from(env, moved_vase(env, (6e-4, 6e-4), (0, 0, 0)), 0, 0)
+    below = step_from(env, moved_vase(env, 6e-4, 6e-4), 0, 0)
     assert not positive(below)
-    above = step_from(env, moved_vase(env, (8e-4, 8e-4), (0, 0, 0)), 0, 0)
+    above = step_from(env, moved_vase(env, 8e-4, 8e-4), 0, 0)
     assert math.isclose(costs(above)["cost_vases_displace"], 2 * 8e-4 * math.sqrt(2), rel_tol=1e-4)
-
-
-def test_moving_vases_cost_their_speed():
-    env = make(VASES)
-    got = costs(step_from(env, moved_vase(env, (0, 0), (0.2, 0.3, 0.6)), 0, 0))
-    assert math.isclose(got["cost_vases_velocity"], 3 * 0.7, rel_tol=1e-6)
-    assert math.isclose(got["cost"], got["cost_vases_velocity"])
-    assert not positive(step_from(env, moved_vase(env, (0, 0), (0, 9e-5, 0)), 0, 0))
-    assert positive(step_from(env, moved_vase(env, (0, 0), (0, 1.1e-4, 0)), 0, 0))
 
 
 def test_only_costs_with_a_factor_have_keys():
@@ -107,14 +97,6 @@ def touching_two_buttons(env, goal: int, timer: int):
     return state
 
 
-def test_only_wrong_buttons_cost():
-    env = make(BUTTONS)
-    for goal, cost in ((0, 2.0), (1, 2.0), (2, 4.0)):
-        got = step_from(env, touching_two_buttons(env, goal, timer=0), 0, 0)
-        assert costs(got)["cost_buttons"] == cost
-        assert bool(got["goal_met"]) == (goal != 2)
-
-
 @pytest.mark.parametrize("timer", [0, 5])
 def test_pressing_the_goal_button_starts_the_timer(timer):
     env = make({**BUTTONS, "buttons_resampling_delay": 7})
@@ -128,17 +110,9 @@ def test_in_other_tasks_all_buttons_are_wrong():
     assert costs(step_from(env, touching_two_buttons(env, -1, 0), 0, 0))["cost_buttons"] == 4.0
 
 
-def test_a_met_goal_puts_buttons_to_sleep_in_goal_tasks_too():
-    env = make({**BUTTONS, "task": "goal", "goal_size": 100.0})
-    assert env.get_state()["buttons_timer"] == 0
-    got = step_from(env, touching_two_buttons(env, -1, 0), 0, 0)
-    assert got["goal_met"]
-    assert env.get_state()["buttons_timer"] == 10
-
-
-@pytest.mark.parametrize("name", ["CarGoal2", "DoggoButton2", "PointPush2"])
-def test_costs_and_rewards_follow_from_them(name):
-    env = SafetyGymEnv(resolve(name).replace(hazards_size=0.9, goal_size=0.01), num_envs=8, seed=0)
+def test_costs_and_rewards_follow_from_positions():
+    config = resolve("CarGoal2").replace(hazards_size=0.9, goal_size=0.01)
+    env = SafetyGymEnv(config, num_envs=8, seed=0)
     tensordict, seen = env.reset(), 0
     for _ in range(30):
         before = env.get_positions()
@@ -149,10 +123,7 @@ def test_costs_and_rewards_follow_from_them(name):
         inside = (to_hazards <= 0.9).any(-1, keepdim=True)
         assert torch.equal(following["cost_hazards"] > 0, inside)
         seen += int(inside.sum())
-        if name == "CarGoal2":
-            old, new = ((p["goal"] - p["robot"])[:, 0, :2].norm(dim=-1) for p in (before, now))
-            torch.testing.assert_close(
-                following["reward"][:, 0].double(), old - new, rtol=0, atol=1e-6
-            )
+        old, new = ((p["goal"] - p["robot"])[:, 0, :2].norm(dim=-1) for p in (before, now))
+        torch.testing.assert_close(following["reward"][:, 0].double(), old - new, rtol=0, atol=1e-6)
         tensordict = following
     assert seen > 0
