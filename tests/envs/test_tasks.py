@@ -13,19 +13,7 @@ from safe_rl.envs.safety_gym.tasks import circle_speed
 POINT = {"robot_base": "point", "placements_extents": [-4, -4, 4, 4]}
 # Without substeps, a step computes the costs and rewards of the state that it starts from.
 FROZEN = {**POINT, "frameskip_binom_p": 0.0}
-GOAL_HEIGHT = 0.3 / 2 + 0.01
 POINT_HEIGHT = 0.1
-
-
-@pytest.mark.parametrize(("distance", "met"), [(0.2999, True), (0.3001, False)])
-def test_a_goal_is_met_within_its_radius(distance, met):
-    env = make({**FROZEN, "goal_size": 0.3, "reward_goal": 5.0})
-    state = arrange(env, robot=(0, 0, 0), goal=(0, distance))
-    got = step_from(env, state, 0, 0)
-    assert bool(got["goal_met"]) == met
-    assert float(got["reward"]) == (5.0 if met else 0.0)
-    # Height does not count.
-    assert abs(float(state["goal_pos"][0, 2]) - GOAL_HEIGHT) < 1e-12
 
 
 @pytest.mark.parametrize(("null_dist", "rewarded"), [(2.0, True), (3.0, False)])
@@ -42,14 +30,6 @@ def test_the_way_to_the_box_is_rewarded_beyond_the_null_distance(null_dist, rewa
     assert 0.01 < lost < 0.03
     expected = -3.0 * lost if rewarded else 0.0
     assert math.isclose(float(got["reward"]), expected, rel_tol=1e-4, abs_tol=1e-6)
-
-
-@pytest.mark.parametrize(("offset", "met"), [(0.295, True), (0.3, False)])
-def test_a_box_is_in_its_goal_by_the_distance_in_space(offset, met):
-    """Box and goal are 0.04 apart in height: 0.2977 and 0.3027 in space."""
-    env = make({**FROZEN, "task": "push"})
-    got = step_from(env, arrange(env, robot=(3, 3, 0), goal=(0, 0), box=(offset, 0, 0)), 0, 0)
-    assert bool(got["goal_met"]) == met
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
