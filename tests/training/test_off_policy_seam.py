@@ -1,12 +1,11 @@
-"""An algorithm of another kind runs in the same loop: replay buffer, random policy, Q updates.
-
-It knows nothing of advantages, state values or multipliers, and the loop nothing of it: training,
+"""An algorithm of another kind runs in the same loop, which knows nothing of it: training,
 checkpoints, resuming, transfer and evaluation are those of every run.
 """
 
 import pytest
 import torch
 from point_mass import PointMass
+from point_mass_runs import trainer_of
 from run_configs import assert_resumes_exactly, point_mass_config
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
@@ -18,7 +17,7 @@ from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import load_policy
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
-from safe_rl.training.building import begin_from, build_trainer, seed_everything
+from safe_rl.training.building import begin_from
 from safe_rl.trust import allow
 
 pytestmark = pytest.mark.long
@@ -39,16 +38,14 @@ class RandomExploration(TensorDictModuleBase):
         return tensordict
 
 
-class OneStepQ(Algorithm):
-    """Fits Q(s, a) to the reward of one step, from a replay buffer."""
+class Drifting(Algorithm):
+    """Moves its policy a little after every batch, and keeps them in a replay buffer."""
 
     cost_keys = ()
 
     def __init__(self, env):
         self.policy = RandomExploration(env)
-        self._q = nn.Linear(env.observation_spec["observation"].shape[-1] + 2, 1)
-        self.networks = {"explorer": self.policy, "q": self._q}
-        self._optimizer = torch.optim.Adam(self._q.parameters(), lr=1e-2)
+        self.networks = {"explorer": self.policy}
         self._buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(2000), batch_size=64)
 
     @classmethod
@@ -62,38 +59,31 @@ class OneStepQ(Algorithm):
 
     def learn(self, batch, episodes):
         self._buffer.extend(batch.reshape(-1))
-        sample = self._buffer.sample()
-        q = self._q(torch.cat([sample["observation"], sample["action"]], -1))
-        loss = (q - sample["next", "reward"]).square().mean()
-        self._optimizer.zero_grad()
-        loss.backward()
-        self._optimizer.step()
         with torch.no_grad():
             self.policy.bias += 0.01
-        return {"q_loss": loss.item()}
+        return {"sampled_reward": self._buffer.sample()["next", "reward"].mean().item()}
 
     def checkpoint_components(self):
-        return {**self.networks, "optimizer": self._optimizer, "buffer": self._buffer}
+        return {**self.networks, "buffer": self._buffer}
 
 
 @pytest.fixture
 def make_trainer(tmp_path):
     allow(__name__)
     (tmp_path / "algo").mkdir()
-    (tmp_path / "algo" / "one_step_q.yaml").write_text(
-        "# @package _global_\nalgo: {name: one_step_q, _target_: test_off_policy_seam.OneStepQ}\n"
+    (tmp_path / "algo" / "mine.yaml").write_text(
+        "# @package _global_\nalgo: {name: mine, _target_: test_off_policy_seam.Drifting}\n"
         "model: {hidden_sizes: [8]}\ncritic_update: {minibatch_size: 1, num_passes: 1}\n"
     )
 
     def make(name, *overrides):
         config = point_mass_config(
             f"hydra.searchpath=[file://{tmp_path}]",
-            *("algo=one_step_q", "cost_limits={}"),
+            *("algo=mine", "cost_limits={}"),
             *overrides,
             minibatch_size=None,
         )
-        seed_everything(config.seed, None)
-        return build_trainer(config, PointMass(4, 20, config.seed), tmp_path / name)
+        return trainer_of(config, tmp_path / name)
 
     return make
 
@@ -103,11 +93,11 @@ def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     line = trainer.run()
     table = read_table(tmp_path / "run" / "progress.csv")
     assert table["steps"] == [160 * epoch for epoch in range(1, 9)]
-    assert table["q_loss"][-1] < table["q_loss"][0]
+    assert len(set(table["sampled_reward"])) == 8
     assert "cost" in line
     second = make_trainer("second", "seed=1")
     taken = begin_from(second.algorithm, {"init_from": tmp_path / "run"})
-    assert taken == ["explorer", "q"]
+    assert taken == ["explorer"]
     assert torch.equal(second.algorithm.policy.bias, trainer.algorithm.policy.bias)
     config, env = Run(tmp_path / "run").config, PointMass(2, 20)
     checkpoint = Run(tmp_path / "run").find_checkpoint("last")
