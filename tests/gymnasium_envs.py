@@ -81,6 +81,24 @@ class Recall(gymnasium.Env):
         return np.zeros(1, np.float32), earned, False, False, {"cost": 1 - earned}
 
 
+class Tank(gymnasium.Env):
+    """A tank that is filled by 0 to 2 litres a step: the amount is the reward, above 1 it costs."""
+
+    action_space = gymnasium.spaces.Box(0.0, 2.0, (1,), np.float32)
+    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.level = np.zeros(1, np.float32)
+        return self.level, {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.level = self.level + action / 40
+        cost = np.float32(max(0.0, action[0] - 1))
+        return self.level, float(action[0]), False, False, {"cost": cost}
+
+
 class Costly(gymnasium.Wrapper):
     """The pendulum with costs for being fast and for being upright."""
 
@@ -98,3 +116,4 @@ def make_pendulum(**kwargs):
 
 gymnasium.register("Recall-v0", entry_point=f"{__name__}:Recall", max_episode_steps=8)
 gymnasium.register("Boxes-v0", entry_point=f"{__name__}:Boxes", max_episode_steps=10)
+gymnasium.register("Tank-v0", entry_point=f"{__name__}:Tank", max_episode_steps=20)

@@ -1,6 +1,9 @@
 """Datasets mean the same in every family: a clone does in the raw environment what they say."""
 
+import functools
+
 import gymnasium
+import gymnasium_envs  # noqa: F401, registers Tank-v0
 import numpy as np
 import pytest
 import torch
@@ -15,27 +18,11 @@ from safe_rl.envs import make_env
 h5py = pytest.importorskip("h5py", reason="comes with the extra hdf5")
 
 
-class Battery(gymnasium.Env):
-    """Current from 0 to 2 earns itself, and costs 1 when it is above 1."""
-
-    action_space = gymnasium.spaces.Box(0.0, 2.0, (1,), np.float32)
-    observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.ones(1, np.float32), {}
-
-    def step(self, action):
-        assert self.action_space.contains(action), action
-        cost = float(action[0] > 1)
-        return np.ones(1, np.float32), float(action[0]), False, False, {"cost": cost}
-
-
-gymnasium.register("Battery-v0", entry_point=f"{__name__}:Battery", max_episode_steps=10)
-
-GYMNASIUM = {"env": "gymnasium", "env.id": "Battery-v0"}
+TANK = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Tank-v0"}
+make_tank = functools.partial(make_env, TANK, num_envs=2)
+GYMNASIUM = {"env": "gymnasium", "env.id": "Tank-v0"}
 FAMILIES = {
-    "bounds [0, 2]": ("Battery-v0", GYMNASIUM, 0.5),
+    "bounds [0, 2]": ("Tank-v0", GYMNASIUM, 0.5),
     "velocity": ("SafeHumanoidVelocity-v0", {"env": "SafeHumanoidVelocity"}, 0.3),
     "safety gym": ("Safexp-PointGoal1-v0", {"env": "PointGoal1", "env.num_steps": 200}, 0.6),
 }
@@ -104,7 +91,7 @@ def learned(*given, **named):
 
 
 def learned_actions(path, env):
-    steps = learned(path, env, "env.id=Battery-v0", name="gymnasium")
+    steps = learned(path, env, "env.id=Tank-v0", name="gymnasium")
     return steps["action"].unique().tolist()
 
 
@@ -118,12 +105,10 @@ def learned_actions(path, env):
     ],
 )
 def test_actions_of_a_file_are_in_the_environment_s_units(action, told, tmp_path):
-    write_episodes(tmp_path / "data.hdf5", "Battery-v0", 1.0)
+    write_episodes(tmp_path / "data.hdf5", "Tank-v0", 1.0)
     with h5py.File(tmp_path / "data.hdf5", "a") as file:
         file["actions"][...] = action
-    env = make_env(
-        {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"}, num_envs=2
-    )
+    env = make_tank()
     if told is None:
         assert learned_actions(tmp_path / "data.hdf5", env) == [round(action - 1, 3)]
         return
@@ -133,11 +118,11 @@ def test_actions_of_a_file_are_in_the_environment_s_units(action, told, tmp_path
 
 def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
     path = tmp_path / "data.hdf5"
-    write_episodes(path, "Battery-v0", 1.0, episodes=2)
+    write_episodes(path, "Tank-v0", 1.0, episodes=2)
     with h5py.File(path, "a") as file:
         file["terminals"][...] = file["timeouts"][:]
-    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"})
-    with pytest.raises(ValueError, match="all episodes that terminate have 10 steps, so these are"):
+    env = make_tank()
+    with pytest.raises(ValueError, match="all episodes that terminate have 20 steps, so these are"):
         learned_actions(path, env)
     write_episodes(path, "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
     with h5py.File(path, "a") as file:
@@ -152,10 +137,8 @@ def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
 
 def test_recorded_actions_are_those_of_the_policy(tmp_path):
     """A policy drew actions beyond its bounds, and the environment clipped them."""
-    env = make_env(
-        {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"}, num_envs=2
-    )
-    steps = env.rollout(10)
+    env = make_tank()
+    steps = env.rollout(20)
     steps["action"].fill_(-1.5)
     Recording(tmp_path / "known", env.cost_keys, env.interface).write(0, steps)
     assert learned_actions(tmp_path / "known", env) == [-1.0]
@@ -250,13 +233,10 @@ def test_paths_may_have_any_characters(tmp_path):
 
 
 def test_a_file_without_names_is_used_with_a_warning(tmp_path):
-    write_episodes(tmp_path / "data.hdf5", "Battery-v0", 0.5)
-    env = make_env({"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "id": "Battery-v0"})
-    config = compose_config(
-        *("algo=bc", "env=gymnasium", "env.id=Battery-v0", f"dataset.path={tmp_path}/data.hdf5"),
-        *("model.hidden_sizes=[8]", "memory.batch_size=4", "cost_limits={cost: 1e6}"),
-    )
-    assert "does not name the columns" in OffPolicy.from_config(config, env).learns_from
+    write_episodes(tmp_path / "data.hdf5", "Tank-v0", 0.5)
+    env = make_tank()
+    path, words = tmp_path / "data.hdf5", ("env.id=Tank-v0",)
+    assert "not name the columns" in learner(path, env, *words, name="gymnasium").learns_from
 
 
 @pytest.mark.long

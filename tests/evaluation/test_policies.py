@@ -8,6 +8,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import gymnasium
+import gymnasium_envs  # noqa: F401, registers Tank-v0
 import numpy as np
 import pytest
 import torch
@@ -133,31 +134,12 @@ def test_an_exported_policy_is_the_policy(run, tmp_path):
         state = env.step(state)["next"]
 
 
-class Tank(gymnasium.Env):
-    """A tank that is filled by 0 to 2 litres a step: the amount is the reward, above 1 it costs."""
-
-    action_space = gymnasium.spaces.Box(0.0, 2.0, (1,), np.float32)
-    observation_space = gymnasium.spaces.Box(0.0, 100.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.level = 0.0
-        return np.array([self.level], np.float32), {}
-
-    def step(self, action):
-        amount = float(action[0])
-        self.level += amount
-        seen = np.array([self.level], np.float32)
-        return seen, amount, False, False, {"cost": np.float32(max(0.0, amount - 1))}
-
-
 def tank_of_torchrl():
-    """The same for TorchRL, with the cost beside the reward."""
+    """An environment of Gymnasium's for TorchRL, with the cost beside the reward."""
     reader = default_info_dict_reader(["cost"], [Unbounded((1,))])
     return GymWrapper(gymnasium.make("Tank-v0")).set_info_dict_reader(reader)
 
 
-gymnasium.register("Tank-v0", entry_point=Tank, max_episode_steps=20)
 PAGE = Path(__file__).parents[2] / "docs" / "policies.md"
 FAMILIES = {
     "SafeHumanoidVelocity": (
