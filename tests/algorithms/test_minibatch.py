@@ -1,6 +1,5 @@
 """Minibatch updates against plain loops and closed forms."""
 
-import copy
 import functools
 
 import pytest
@@ -114,24 +113,6 @@ def test_compiled_and_plain_updates_agree():
         results.append((update(batch), actor.get_dist(batch).mean))
     torch.testing.assert_close(*(mean for _, mean in results), atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(*(diagnostics for diagnostics, _ in results), atol=1e-4, rtol=1e-2)
-
-
-def test_state_dict_continues_the_optimiser():
-    batch, losses = samples(20), [RecordingLoss() for _ in range(2)]
-    updates = [
-        MinibatchUpdate(loss, optimizer=adam, num_passes=2, minibatch_size=None) for loss in losses
-    ]
-    updates[0](batch)
-    losses[1].load_state_dict(losses[0].state_dict())
-    updates[1].load_state_dict(copy.deepcopy(updates[0].state_dict()))
-    for update in updates:
-        update(batch)
-    assert torch.equal(losses[0].w, losses[1].w)
-    # Adam without its moments would have taken another step
-    fresh = MinibatchUpdate(losses[1], optimizer=adam, num_passes=1, minibatch_size=None)
-    fresh(batch)
-    updates[0](batch)
-    assert not torch.equal(losses[0].w, losses[1].w)
 
 
 def test_gradients_are_clipped():

@@ -83,20 +83,6 @@ def test_targets_go_a_tenth_of_the_way_to_where_the_networks_have_gone(memory):
         assert not trained.equal(before[name][0])
 
 
-def test_a_loaded_update_goes_on_as_the_saved_one(memory):
-    saved, loaded = make_update(0), make_update(1)
-    saved(memory, 6)
-    loaded.load_state_dict(deepcopy(saved.state_dict()))
-    for update in (saved, loaded):
-        torch.manual_seed(2)
-        update(memory, 6)
-    for (name, (trained, target)), others in zip(
-        networks(saved).items(), networks(loaded).values(), strict=True
-    ):
-        assert trained.equal(others[0]), name
-        assert target.equal(others[1]), name
-
-
 def test_an_update_that_is_resumed_discounts_as_it_is_told(memory):
     before, resumed = make_td3(), make_td3(gamma=0.1)
     resumed.load_state_dict(before.state_dict())

@@ -127,23 +127,6 @@ def test_means_are_nan_and_rates_are_known_before_an_episode_finishes():
     ]  # fmt: skip
 
 
-def test_a_saved_state_continues_open_episodes_and_is_not_changed_by_later_batches():
-    generator = torch.Generator().manual_seed(3)
-    batches = [random_batch(generator, 4, 10, 0.1) for _ in range(2)]
-    first, second = EpisodeAccounting(4, COST_KEYS), EpisodeAccounting(4, COST_KEYS)
-    first.update(batches[0])
-    state = first.state_dict()
-    before = {name: value.clone() for name, value in state.items()}
-    second.load_state_dict(state)
-    expected, continued = first.update(batches[1]), second.update(batches[1])
-    assert torch.equal(expected.returns, continued.returns)
-    assert torch.equal(expected.cost_rates["cost"], continued.cost_rates["cost"])
-    second.load_state_dict(state)
-    second.forget_open_episodes()
-    second.update(batches[1])
-    assert all(torch.equal(state[name], before[name]) for name in state)
-
-
 def test_episodes_that_are_open_can_be_left_out_of_the_statistics_of_episodes():
     generator = torch.Generator().manual_seed(0)
     whole, partial = EpisodeAccounting(3, COST_KEYS), EpisodeAccounting(3, COST_KEYS)

@@ -153,28 +153,6 @@ def test_episodes_of_an_evaluation_are_whole_unless_they_are_to_end_too(in_evalu
     assert batch["done"].squeeze().nonzero()[:, 0].tolist() == (ends or [5])
 
 
-@pytest.mark.parametrize("env", ["point_mass", "safety_gym"])
-@pytest.mark.parametrize("names", [ALL_BUT_SAUTE, ALL_BUT_SAUTE[:-1]])
-def test_a_snapshot_continues_exactly(env, names):
-    env = transformed(env, *names, seed=0)
-
-    def resume(state):
-        torch.manual_seed(1)
-        return env.rollout(
-            15, auto_reset=False, tensordict=env.set_state(state), break_when_any_done=False
-        )
-
-    env.rollout(5)
-    state = env.get_state()
-    first, second = resume(state.clone()), resume(state.clone())
-    assert (first["next", "observation"][..., -1] != 1).any()
-    for key in ("observation", "reward", "terminated", "cost_interventions"):
-        assert torch.equal(first["next", key], second["next", key])
-    # without the states of transforms, the budgets of the episodes begin again
-    begun = env.set_state(state.exclude("transforms"))
-    assert begun["observation"].shape == first["observation"][:, 0].shape
-
-
 def test_transforms_of_torchrl_can_stand_among_ours():
     env = transformed(PointMass(2), "saute", count=StepCounter())
     check_env_specs(env)

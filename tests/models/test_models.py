@@ -148,16 +148,6 @@ def test_nothing_is_changed_before_anything_is_observed_but_for_the_cut():
     assert running(torch.tensor([[7.5, 4.0]])).tolist() == [[0.5, 2.0]]
 
 
-def test_a_checkpoint_holds_them():
-    first, second = (RunningScale(3, key="observation", clip=10.0) for _ in range(2))
-    before, after = batches(2)
-    first.update(before)
-    second.load_state_dict(first.state_dict())
-    for running in (first, second):
-        running.update(after)
-    assert all((x == y).all() for x, y in zip(first.buffers(), second.buffers(), strict=True))
-
-
 def test_losses_that_were_made_before_see_them_move():
     """Losses hold the parameters of their networks in containers of their own."""
     critic = make_critic(3, hidden_sizes=[4])
