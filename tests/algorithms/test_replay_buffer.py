@@ -91,31 +91,6 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         assert step["next", "terminated"].item() is (reaches_the_end and terminates)
 
 
-def check_draws(memory, copy, batch):
-    """Both give the same minibatches after another batch."""
-    drawn = []
-    for each in (memory, copy):
-        torch.manual_seed(3)
-        each.extend(batch.clone())
-        drawn.append(torch.cat([m["observation"] for m in each.minibatches(3)]))
-    assert torch.equal(*drawn)
-
-
-@pytest.mark.parametrize("n_steps", [1, 3])
-@pytest.mark.parametrize("batches", [0, 1, 4])
-def test_a_copy_goes_on_in_the_same_way(n_steps, batches, tmp_path):
-    keys = {"n_steps": n_steps, "capacity": 20}
-    memory, copy = make_memory(**keys), make_memory(**keys)
-    copy.extend(make_batch(50, 4))  # which loading forgets
-    for number in range(batches):
-        memory.extend(make_batch(5 * number, 5))
-    torch.save(memory.state_dict(), tmp_path / "state")
-    copy.load_state_dict(torch.load(tmp_path / "state", weights_only=True))
-    assert len(memory) == len(copy)
-    check_draws(memory, copy, make_batch(5 * batches, 5))
-    assert len(memory) == len(copy)
-
-
 @pytest.mark.parametrize(("length", "ends"), [(2, [1]), (8, [2, 7]), (8, [2])])
 def test_rows_that_end_keep_no_step_back(length, ends):
     """The last episode of a dataset's row may be the only one that it has."""
