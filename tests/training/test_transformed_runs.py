@@ -169,13 +169,12 @@ def command(tmp_path, monkeypatch, capsys):
             ["algo=ppo", "transforms=[simmer]", "collector=process", "collector.num_collectors=2"],
             marks=pytest.mark.slow,
         ),
-        ["algo=ppo", "transforms=[saute,early_termination]", "cost_limits={cost: 0.5}"],
         [
             *("algo=ppo_lagrangian", "transforms=[action_filter]", FILTER),
             *("import=test_transforms_filters.py", "cost_limits={cost_interventions: 3}"),
         ],
     ],
-    ids=["processes", "early_termination", "action_filter"],
+    ids=["processes", "action_filter"],
 )
 def test_the_command_line_runs_them(command, arguments):
     status, _, said = command(*RUN, *arguments)
