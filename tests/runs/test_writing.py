@@ -130,20 +130,6 @@ def test_what_is_killed_while_it_begins_leaves_no_table_without_a_configuration(
     assert not Run(tmp_path).has_begun
 
 
-def test_writing_ends_cleanly_when_training_fails(tmp_path):
-    config = compose_config("env=PointMass", "logger=none")
-    writer = RunWriter(Run(tmp_path), config, {}, 1000)
-
-    def fail():
-        with writer.writing():
-            writer.add(row(1, 0.0, 0.0))
-            raise FloatingPointError
-
-    with pytest.raises(FloatingPointError):
-        fail()
-    assert len(writer.run.table_file.read_text().splitlines()) == 2
-
-
 def test_an_estimate_of_the_mean_is_no_other_measure(tmp_path, capsys):
     """limits=paper estimates the mean from batches shorter than episodes."""
     config = compose_config("env=PointMass", "logger=none", "limits=paper")
