@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pandas
@@ -15,49 +14,6 @@ ROOT = Path(__file__).resolve().parents[2]
 def said(page):
     """A page without its line breaks."""
     return " ".join((ROOT / page).read_text().split())
-
-
-def run_of(costs, steps=10_000, certificate=None):
-    """A run whose epochs have these costs; returns are the numbers of the epochs."""
-    table = {
-        "steps": [steps * n for n in range(1, len(costs) + 1)],
-        "episode_return": [float(n) for n in range(1, len(costs) + 1)],
-        "episode_cost": costs,
-        "cost_rate": [0.5] * len(costs),
-    }
-    return SimpleNamespace(table=table, notes={"certificate": certificate})
-
-
-def test_figures_are_those_of_the_end_and_of_spans_of_20_000_steps():
-    run = run_of([90.0, 90.0, 10.0, 30.0, 30.0, 30.0])
-    # spans from 20,000 steps on have the means 20 and 30, of which one is above 25
-    assert results.figures(run, last=30_000, start=20_000) == {
-        "return": 5.0,
-        "cost": 30.0,
-        "since": 25.0,
-        "above": 0.5,
-        "rate": 0.5,
-    }
-
-
-def test_a_row_has_the_mean_and_the_deviation_among_seeds():
-    names = dict.fromkeys(("environment", "algorithm", "name"), "")
-    runs = [run_of([10.0, 20.0]), run_of([10.0, 30.0])]
-    group = pandas.DataFrame([names | {"run": run} for run in runs])
-    row = results.summary(group, last=10_000)
-    assert (row["seeds"], row["cost"], row["return"]) == (2, "25.0 ± 7.1", "2.0 ± 0.0")
-    assert results.summary(group[:1], last=10_000)["cost"] == "20.0"
-
-
-def test_certificates_are_counted_among_the_runs_that_were_tested():
-    ends = [
-        None,
-        {"certified": True, "episode_return": 3.0},
-        {"certified": False, "episode_return": 1},
-    ]
-    group = pandas.DataFrame({"run": [run_of([1.0], certificate=end) for end in ends]})
-    assert results.certified(group) == "1 of 2, at 3.0"
-    assert results.certified(group[:1]) == "—"
 
 
 @pytest.fixture(scope="module")
@@ -137,15 +93,6 @@ def test_how_far_off_the_cost_critics_are():
         costs.append(results.figures(run, 5e5)["cost"])
     words = f"{min(told):.0f} to {max(told):.0f} on PointGoal1, where episodes cost"
     assert f"{words} {min(costs):.0f} to {max(costs):.0f}." in said("docs/off_policy.md")
-
-
-def test_coverage_counts_the_seeds_of_finished_runs():
-    steps = {1: 3_000_000, 2: 3_000_000, 3: 1_000_000}
-    of_runs = [SimpleNamespace(steps=n) for n in steps.values()]
-    group = pandas.DataFrame({"algorithm": "cpo", "seed": [*steps], "run": of_runs})
-    assert results.seeds(group) == "2 × 3M, 1 × 1M"
-    assert results.seeds(group, by_name=True) == "2 × 3M: `cpo`; 1 × 1M: `cpo`"
-    assert results.seeds(group[:0]) == ""
 
 
 def test_every_environment_has_results_as_readme_says():
