@@ -46,7 +46,7 @@ def columns_of_a_run(config, folder):
 def test_the_columns_are_those_of_a_run(algo, tmp_path):
     config = point_mass_config(
         f"algo={algo}",
-        "frames=480",
+        "frames=160",
         "cost_limits={cost_hazards: 1, cost_north: 1}",
         minibatch_size=None if "trpo" in columns_of(algo) else 40,
     )
