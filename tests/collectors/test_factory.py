@@ -28,14 +28,6 @@ def test_batches_are_consecutive_rollouts_with_all_the_keys_of_the_policy():
     assert joined["next", "done"].sum() == 3 * (20 // 7)
 
 
-def test_a_yielded_batch_is_not_overwritten_by_the_next():
-    batches = iter(make_collector(PointMass(3), make_policy(), frames_per_batch=30))
-    first = next(batches)
-    before = first.clone()
-    next(batches)
-    assert (first == before).all()
-
-
 def test_frames_must_be_shared_equally():
     with pytest.raises(ValueError, match="use 9 or 12"):
         make_collector(PointMass(3), make_policy(), frames_per_batch=10)

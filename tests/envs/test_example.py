@@ -4,7 +4,7 @@ import runpy
 from types import SimpleNamespace
 
 import pytest
-from commands import ROOT, in_a_process, status_of
+from commands import ROOT, SMALL, in_a_process, status_of
 
 from safe_rl.cli.evaluate import main as evaluate
 from safe_rl.envs import SafetyGymEnv
@@ -15,11 +15,6 @@ pytestmark = pytest.mark.long
 PATH = ROOT / "examples" / "custom_environment.py"
 IMPORT = f"import={PATH.relative_to(ROOT)}"
 MINES = ("env=PointMines", "cost_limits={cost_mines: 10}", "env.mines_num=8")
-SHORT = (
-    *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "frames=80", "logger=none"),
-    *("model.hidden_sizes=[8]", "policy_update.minibatch_size=20"),
-    *("critic_update.minibatch_size=20", "num_threads=1"),
-)
 
 
 @pytest.fixture
@@ -30,9 +25,10 @@ def example(registrations_undone):
 def test_it_is_trained_resumed_and_evaluated_by_the_ordinary_commands(
     tmp_path, monkeypatch, registrations_undone
 ):
-    # with workers, which have to import it too
-    begun = (*MINES, *SHORT, "collector=process", f"hydra.run.dir={tmp_path}")
-    in_a_process("train.py", IMPORT, *begun)
+    # with a worker, which has to import it too
+    worker = ("collector=process", "collector.num_collectors=1")
+    begun = (*MINES, *SMALL, "frames=80", f"hydra.run.dir={tmp_path}")
+    in_a_process("train.py", IMPORT, *begun, *worker)
     assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
     monkeypatch.chdir(ROOT)
     resume = (f"resume={tmp_path}", "frames=160")

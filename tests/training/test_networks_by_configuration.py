@@ -27,8 +27,7 @@ PPO = ("policy_update.minibatch_size=80", "policy_update.num_passes=2")
 DICTIONARY = ("model=dict", "model.encoders.vector=[4]", "env.observation_flatten=false")
 CHOICES = {
     "dictionary": (*DICTIONARY, *PPO),
-    "memory": ("model=gru", "model.memory.size=4", "model.normalise=10", *PPO),
-    "memory_cpo": ("model=gru", "model.memory.size=4", "algo=cpo"),
+    "memory": ("model=gru", "model.memory.size=4", "model.normalise=10", "algo=cpo"),
 }
 
 
@@ -47,7 +46,8 @@ def test_runs_resume_to_the_last_digit(kind, tmp_path):
 def test_workers_normalise_as_the_first_process_does(tmp_path):
     """What they are sent before every batch is also what they divide by."""
     config = compose_config(
-        *SMALL, *PPO, "env=PointGoal1", "model.normalise=10", "frames=480", "collector=process"
+        *(*SMALL, *PPO, "env=PointGoal1", "model.normalise=10", "frames=480"),
+        *("collector=process", "collector.num_collectors=1"),
     )
     seed_everything(0, 1)
 
