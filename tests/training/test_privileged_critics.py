@@ -26,8 +26,10 @@ RUNS = {
     "td3": ("td3_lagrangian", {**REPLAY, "memory.n_steps": 3}),
     "cal": ("cal", REPLAY),
     "cpo": ("cpo", {}),
-    "normalise": ("trpo_lagrangian", {"model.normalise": 10}),
-    "dict": ("ppo_lagrangian", {**BATCH, "model": "dict", "env.observation_flatten": False}),
+    "dict": (
+        "trpo_lagrangian",
+        {"model": "dict", "model.normalise": 10, "env.observation_flatten": False},
+    ),
     "gru": ("ppo_lagrangian", {**BATCH, "model": "gru"}),
     "workers": (
         "ppo_lagrangian", {**BATCH, "collector": "process", "collector.num_collectors": 2}
