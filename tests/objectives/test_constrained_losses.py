@@ -78,7 +78,7 @@ def test_gradients_against_finite_differences(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", LOSSES)
+@pytest.mark.parametrize("name", sorted({*LOSSES} - {"ppo", "trpo"}))  # see test_ppo
 def test_they_compile(name):
     torch._dynamo.reset()
     actor = make_actor()
