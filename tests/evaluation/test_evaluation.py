@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from safe_rl.cli.evaluate import main
 from safe_rl.envs import make_env
 from safe_rl.evaluation import evaluate
+from safe_rl.runs.folder import is_unfinished
 from safe_rl.runs.run import Run
 
 
@@ -94,7 +95,7 @@ def test_what_is_interrupted_leaves_the_evaluation_of_before(run, monkeypatch):
         with pytest.raises(OSError, match="no space"):
             evaluate(run, options(episodes=2))
     assert {path.name: path.read_bytes() for path in run.glob("evaluation*")} == before
-    assert not list(run.glob(".*unfinished*"))
+    assert not [path for path in run.iterdir() if is_unfinished(path)]
 
 
 def test_environments_are_closed_whatever_happens(run, monkeypatch):

@@ -17,18 +17,21 @@ def listing(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_link_in_the_place_of_an_unfinished_file_is_not_followed(tmp_path):
-    """Where the name could be foreseen, a link of this name was written through."""
+def test_a_link_in_the_place_of_an_unfinished_file_is_not_followed(tmp_path, monkeypatch):
+    """Not even if its name could be foreseen."""
     mine, run = tmp_path / "bashrc", tmp_path / "run"
     run.mkdir()
     mine.write_text(MINE)
-    (run / ".progress.unfinished.csv").symlink_to(mine)
-    replace_text(run / "progress.csv", "steps\n")
+    with monkeypatch.context() as patch:
+        patch.setattr("secrets.token_hex", lambda size: "0a")
+        (run / ".progress.0a.csv").symlink_to(mine)
+        with pytest.raises(FileExistsError):
+            replace_text(run / "progress.csv", "steps\n")
     (run / "code.json").symlink_to(mine)
     replace_text(run / "code.json", "[]")  # takes the link's place
     assert mine.read_text() == MINE
     assert (run / "code.json").read_text() == "[]"
-    assert listing(run) == [".progress.unfinished.csv", "code.json", "progress.csv"]
+    assert listing(run) == [".progress.0a.csv", "code.json"]
 
 
 @pytest.mark.parametrize(
