@@ -8,14 +8,11 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from commands import ROOT, SMALL
 
 from safe_rl.runs.table import read_table
 
-ROOT = Path(__file__).parents[1]
-SHORT = (
-    *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "frames=40", "logger=none"),
-    *("model.hidden_sizes=[8]", "critic_update.minibatch_size=20", "num_threads=1"),
-)
+SHORT = (*SMALL, "frames=40")
 
 
 def run(*words, cwd, **environment):
