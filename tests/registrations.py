@@ -16,7 +16,6 @@ from safe_rl.envs.extending import (
     register_cost,
     register_element,
 )
-from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import KEYS, ROBOTS
 from safe_rl.envs.safety_gym.costs import COSTS
 from safe_rl.envs.safety_gym.elements import BY_KIND, ELEMENTS, PLACEMENT_ORDER
@@ -40,7 +39,6 @@ def undone() -> Iterator[None]:
             table.clear()
             table.update(rows)
         store_configs()  # the keys that Hydra knows
-        forget_scenes()
 
 
 def cube(kind: str, label: str, motion: Motion, group: int = 2) -> Element:

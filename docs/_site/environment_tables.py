@@ -5,11 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from result_tables import markdown as table
 
-from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv, key_table
+from safe_rl.envs import EXTRAS, SUITE, SafetyGymEnv
+from safe_rl.envs.keys import adapter
+from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.envs.safety_gym.costs import COSTS, EXCEPTION_KEY
 from safe_rl.envs.safety_gym.elements import ELEMENTS
@@ -95,13 +98,31 @@ def keys() -> str:
     source = inspect.getsource(Keys)
     heading = {key: name for name, key in re.findall(r"\n    # ([^\n]+)\n    (\w+):", source)}
     groups: dict[str, list[Sequence[str]]] = {}
-    for row in key_table():
-        if row.name in heading:
-            groups[heading[row.name]] = []
-        cells = (f"`{row.name}`", row.values, f"`{row.default}`", row.meaning)
+    for key, row in KEYS.items():
+        if key in heading:
+            groups[heading[key]] = []
+        values = _words(adapter(row.annotation).json_schema())
+        cells = (f"`{key}`", values, f"`{row.default}`", row.meaning)
         next(reversed(groups.values())).append(cells)
     head = ["key", "allowed values", "default", "meaning"]
     return "\n\n".join(f"## {n.capitalize()}\n\n{table(head, rows)}" for n, rows in groups.items())
+
+
+def _words(schema: Mapping[str, Any]) -> str:
+    """The values that a JSON schema allows."""
+    if "anyOf" in schema:
+        return ", or ".join(map(_words, schema["anyOf"]))
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    if schema["type"] == "array":
+        items = schema.get("prefixItems", ())
+        number = f"{len(items)} times " if items else ""
+        return f"list of {number}{_words(items[0] if items else schema['items'])}"
+    words = {"string": "text", "boolean": "true or false"}.get(schema["type"], schema["type"])
+    for name, word in {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to"}.items():
+        if abs(schema.get(name, 1e9)) < 1e9:
+            words += f" {word} {schema[name]:,g}"
+    return words
 
 
 def observations() -> str:

@@ -15,7 +15,7 @@ from safe_rl.envs.families import (
     store_configs,
 )
 from safe_rl.envs.keys import ConfigError
-from safe_rl.envs.safety_gym.config import SafetyGymConfig, key_table
+from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.extras import import_later
 
@@ -42,7 +42,6 @@ __all__ = [
     "env_node",
     "from_gymnasium",
     "from_six_values",
-    "key_table",
     "make_env",
     "resolve",
     "store_config",

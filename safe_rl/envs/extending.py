@@ -14,7 +14,6 @@ from typing import Any
 from pydantic import NonNegativeFloat, PositiveFloat
 
 from safe_rl.envs.keys import ConfigError, Key
-from safe_rl.envs.safety_gym.building import forget_scenes
 from safe_rl.envs.safety_gym.config import KEYS, ROBOTS, infer_key, register_keys
 from safe_rl.envs.safety_gym.config_keys import Locations, Objects, Placements
 from safe_rl.envs.safety_gym.costs import (
@@ -123,7 +122,6 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
     BY_KIND[element.kind] = element
     if element.kind not in PLACEMENT_ORDER:
         PLACEMENT_ORDER.append(element.kind)
-    forget_scenes()
 
 
 def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) -> None:
@@ -150,7 +148,6 @@ def register_task(name: str, task: Task, keys: Mapping[str, Any] | None = None) 
         raise ConfigError(f"Task '{name}' meets or draws goals: add 'goal' to its elements.")
     _add_keys(keys)
     TASKS[name] = task
-    forget_scenes()
 
 
 def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
@@ -178,7 +175,6 @@ def register_cost(cost: Cost, keys: Mapping[str, Any] | None = None) -> None:
     _refuse_unknown_flags(cost.flags, keys)
     _add_keys(keys)
     COSTS[:] = [*(row for row in COSTS if row.key != cost.key), cost]
-    forget_scenes()
 
 
 def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None) -> None:
@@ -205,7 +201,6 @@ def register_observation(reading: Reading, keys: Mapping[str, Any] | None = None
     _refuse_unknown_flags(reading.flags, keys)
     _add_keys(keys)
     READINGS[:] = [*(row for row in READINGS if row.name != reading.name), reading]
-    forget_scenes()
 
 
 def register_robot(name: str, path: str | Path) -> None:
@@ -217,7 +212,6 @@ def register_robot(name: str, path: str | Path) -> None:
     _refuse_taken("robot", name)
     load_robot(Path(path))
     ROBOTS[name] = Path(path)
-    forget_scenes()
 
 
 def _refuse_taken(what: str, name: str) -> None:

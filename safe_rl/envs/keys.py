@@ -71,35 +71,6 @@ def as_plain(value: Any) -> Any:
     return tuple(map(as_plain, value))
 
 
-def describe(annotation: Any) -> str:
-    """Return the allowed values of an annotation in words.
-
-    Examples:
-        >>> from safe_rl.checks import Share
-        >>> describe(Share | None)
-        'number from 0 to 1, or null'
-    """
-    return _words(adapter(annotation).json_schema())
-
-
-def _words(schema: Mapping[str, Any]) -> str:
-    if "anyOf" in schema:
-        return ", or ".join(map(_words, schema["anyOf"]))
-    if "enum" in schema:
-        return f"one of {', '.join(map(str, schema['enum']))}"
-    kind = schema.get("type", "anything")
-    if kind == "array":
-        items = schema.get("prefixItems") or [schema["items"]]
-        number = f"{len(items)} times " if "prefixItems" in schema else ""
-        return f"list of {number}{_words(items[0])}"
-    words = {"string": "text", "boolean": "true or false"}.get(kind, kind)
-    bounds = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to"}
-    for name, word in bounds.items():
-        if name in schema and abs(schema[name]) < 1e9:
-            words += f" {word} {schema[name]:,g}"
-    return words
-
-
 def structured(name: str, keys: Mapping[str, Key]) -> type:
     """Return a dataclass of keys for Hydra's ConfigStore.
 

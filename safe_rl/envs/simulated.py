@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import mujoco
@@ -40,6 +40,8 @@ class SimulatedEnv(ConstrainedEnv):
     flags: ClassVar[tuple[str, ...]] = ("done", "terminated", "truncated")
     #: Default camera of pictures.
     first_camera: ClassVar[str]
+    #: Keys that may be missing in a state that is set.
+    optional: ClassVar[tuple[str, ...]] = ("seed", "episode", "dynamics")
     #: Attributes, tensors, that a copy gets in addition to the state.
     copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
 
@@ -198,7 +200,7 @@ class SimulatedEnv(ConstrainedEnv):
         if not self._all_begun:
             rows = (~self._begun).nonzero()[:, 0].tolist()
             which = f" of rows {rows}" if self._begun.any() else ""
-            raise ResetNeededError(f"No episode has begun{which}: call reset() before a step.")
+            raise RuntimeError(f"No episode has begun{which}: call reset() before a step.")
         return action.detach().to(self._physics.device)
 
     @abstractmethod
@@ -223,7 +225,7 @@ class SimulatedEnv(ConstrainedEnv):
 
     @abstractmethod
     def _write_state(self, state: TensorDictBase) -> None:
-        """Check a state, and set the worlds to it."""
+        """Set the worlds to a state whose keys, shapes and types are right."""
 
     def get_state(self) -> TensorDict:
         """Return a copy of the state, a TensorDict [N]: it determines all later steps and draws."""
@@ -244,6 +246,7 @@ class SimulatedEnv(ConstrainedEnv):
             KeyError: If a key is missing.
             ValueError: If a shape, a type or a value does not fit.
         """
+        self._check_state(state)
         if self._dynamics is not None and "dynamics" in state:
             self._dynamics.set(state["dynamics"], torch.ones_like(self._begun))
         self._write_state(state)
@@ -253,6 +256,23 @@ class SimulatedEnv(ConstrainedEnv):
         self._begun.fill_(True)
         self._all_begun = True
         return self._output(self._begun.new_zeros(len(self.flags), len(self._begun)))
+
+    def _check_state(self, state: TensorDictBase) -> None:
+        expected = self.get_state()
+        for key, value in expected.items():
+            if key not in state:
+                if key in self.optional:
+                    continue
+                needed = sorted(set(expected.keys()) - set(self.optional))
+                raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
+            given = state[key]
+            if given.shape != value.shape:
+                raise ValueError(
+                    f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
+                    f"{tuple(given.shape)}."
+                )
+            if not value.dtype.is_floating_point and given.dtype != value.dtype:
+                raise ValueError(f"State '{key}' must be {value.dtype}, got {given.dtype}.")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let `copy` and `pickle` build a new environment and set its state by `set_state`."""
@@ -304,30 +324,3 @@ class SimulatedEnv(ConstrainedEnv):
         if "_renderer" in vars(self):  # it is made for the first picture
             self._renderer.close()
         super().close(raise_if_closed=raise_if_closed)
-
-
-class ResetNeededError(RuntimeError):
-    """A step was taken before the first reset."""
-
-
-def check_state(expected: TensorDictBase, state: TensorDictBase, optional: Collection[str]) -> None:
-    """Check a state, some of whose keys are optional, against one that the environment made.
-
-    Raises:
-        KeyError: If a key is missing that is not optional.
-        ValueError: If a shape or a type does not fit.
-    """
-    for key, value in expected.items():
-        if key not in state:
-            if key not in (*optional, "dynamics"):
-                needed = sorted(set(expected.keys()) - set(optional))
-                raise KeyError(f"The state lacks '{key}'; it needs {needed}.")
-            continue
-        given = state[key]
-        if given.shape != value.shape:
-            raise ValueError(
-                f"State '{key}' must have shape {tuple(value.shape)} in this environment, got "
-                f"{tuple(given.shape)}."
-            )
-        if not value.dtype.is_floating_point and given.dtype != value.dtype:
-            raise ValueError(f"State '{key}' must be {value.dtype}, got {given.dtype}.")

@@ -148,13 +148,6 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _NO_STAGE = int(mujoco.mjtStage.mjSTAGE_NONE)
 
 
-MOST_FAILURES = 10  # steps in a row in which all simulations fail
-
-
-class PhysicsError(RuntimeError):
-    """All simulations fail in every step."""
-
-
 class BatchPhysics(Physics):
     """N simulations on the CPU, in float64.
 
@@ -211,7 +204,7 @@ class BatchPhysics(Physics):
         self._disableflags = self.batch.expand("opt.disableflags")
         self._with_sensors = int(model.opt.disableflags)
         self._warnings = np.zeros_like(self.batch.warning)
-        self._num_failures, self._all_failed = 0, 0
+        self._has_failed = False
 
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` to the model's initial state, see `Physics`."""
@@ -255,31 +248,21 @@ class BatchPhysics(Physics):
         # MuJoCo resets a bad state by itself, and only increments a warning counter.
         counts = self.batch.warning
         if np.array_equal(counts, self._warnings):
-            self._all_failed = 0
             return torch.zeros(len(counts), dtype=torch.bool, device=self.device)
         failed = (counts[..., 1] > self._warnings[..., 1]).any(-1)
         counts[failed] = 0  # a next failure increments them again
         self._warnings[:] = counts
         self.ctrl[failed] = 0.0
-        self._report(failed)
-        return torch.from_numpy(failed)
-
-    def _report(self, failed: np.ndarray) -> None:
-        """Say once that simulations fail; raise if all of them do, several times in a row."""
-        if failed.any() and not self._num_failures:
+        if failed.any() and not self._has_failed:
+            self._has_failed = True
             warnings.warn(
                 f"The physics of {failed.sum()} of {len(failed)} simulations failed (a state that "
-                "is huge or no number): their episodes end. Later failures are not shown.",
+                "is huge or no number): their episodes end. Later failures are not shown. If all "
+                "fail, check the robot's file and the actions.",
                 RuntimeWarning,
                 stacklevel=2,
             )
-        self._num_failures += int(failed.sum())
-        self._all_failed = self._all_failed + 1 if failed.all() else 0
-        if self._all_failed == MOST_FAILURES:
-            raise PhysicsError(
-                f"The physics of all simulations failed in {MOST_FAILURES} steps in a row, "
-                f"{self._num_failures} failures in all: check the robot's file and the actions."
-            )
+        return torch.from_numpy(failed)
 
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
         """Cast rays into the simulations as their state is now, see `Physics`."""

@@ -119,16 +119,7 @@ class DrawnDynamics:
         self.set(torch.where(mask[:, None], self._low + self._width * draws, self.factors), mask)
 
     def set(self, factors: Tensor, mask: Tensor) -> None:
-        """Set the factors [N, K] of the simulations of a mask [N]; outputs follow later.
-
-        Raises:
-            ValueError: If they have another shape.
-        """
-        if factors.shape != self.factors.shape:
-            raise ValueError(
-                f"State 'dynamics' must have shape {tuple(self.factors.shape)} in this "
-                f"environment, got {tuple(factors.shape)}."
-            )
+        """Set the factors [N, K] of the simulations of a mask [N]; outputs follow later."""
         self.factors = factors.clone()
         chosen = mask.nonzero()[:, 0].numpy()
         for column, values, base, rows in self._scaled:

@@ -1,22 +1,22 @@
 """Compile the model of a configuration, and find the indices of objects in its arrays.
 
-The model is compiled once per configuration. Everything that differs between episodes is state:
-free bodies are in `qpos`, and static bodies are mocap bodies. The order of bodies is robot, vases,
-gremlins, box, the gremlins' targets, static bodies.
+Everything that differs between episodes is state: free bodies are in `qpos`, and static bodies are
+mocap bodies. The order of bodies is robot, vases, gremlins, box, the gremlins' targets, static
+bodies.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from pathlib import Path
+from typing import Any
 
 import mujoco
 
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
-from safe_rl.envs.safety_gym.config import BUNDLED, ROBOTS, SafetyGymConfig
+from safe_rl.envs.safety_gym.config import ROBOTS, SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import active_costs
 from safe_rl.envs.safety_gym.elements import (
     ELEMENTS,
@@ -27,7 +27,7 @@ from safe_rl.envs.safety_gym.elements import (
     Motion,
 )
 from safe_rl.envs.safety_gym.observations import active_readings
-from safe_rl.envs.safety_gym.robots import Robot, fingerprint, load_robot
+from safe_rl.envs.safety_gym.robots import Robot, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.envs.safety_gym.world import Scene
 from safe_rl.naming import did_you_mean
@@ -60,18 +60,7 @@ def build_scene(config: SafetyGymConfig, sleep: bool = False, decorated: bool = 
     A `decorated` world is for pictures: areas are bodies too, and there are cameras, light and a
     floor pattern. It has the same `qpos` and first mocap bodies as the plain world.
     """
-    path = ROBOTS.get(config.robot_base, Path(config.robot_base))
-    # if the file of a user's robot has changed, the world is compiled again
-    content = "" if path.parent == BUNDLED else fingerprint(path)
-    return _compile(config, path, content, sleep, decorated)
-
-
-@functools.lru_cache(maxsize=64)
-def _compile(
-    config: SafetyGymConfig, path: Path, content: str, sleep: bool, decorated: bool
-) -> Scene:
-    """Build a scene for the present content of its robot's files."""
-    robot = load_robot(path)
+    robot = load_robot(ROBOTS.get(config.robot_base, Path(config.robot_base)))
     spec = robot.spec
     spec.memory = ARENA_BYTES
     # With this option, MuJoCo 4.0.0 computes wrong normals for cylinders; MuJoCo 2 lacks it.
@@ -115,24 +104,23 @@ def _compile(
     return _index(config, model, robot, present, guided, placed, contact_names)
 
 
-# To be called after an element, task, cost, observation or robot is registered.
-forget_scenes = _compile.cache_clear
-
-
 def _add_bodies(
     spec: mujoco.MjSpec, config: SafetyGymConfig, element: Element, decorated: bool
 ) -> None:
     """Add a body per object: a free body if it can be pushed, else a mocap body.
 
-    Areas have a shape only if rays see them, or in a `decorated` world, which is for pictures.
+    Areas have a shape only if rays see them, or in a `decorated` world, which is for pictures. The
+    goal of a button task has none: its button is seen.
     """
+    stands_in = element.kind == "goal" and TASKS[config.task].goal_at_button
+    shows_area = (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
     for name in element.names(config):
         body = spec.worldbody.add_body(
             name=name, pos=[0, 0, element.height(config)], mocap=element.motion not in PUSHED
         )
         if element.motion in PUSHED:
             body.add_freejoint(name=name)
-        if element.motion is not Motion.VIRTUAL or _shows_area(config, element, decorated):
+        if element.motion is not Motion.VIRTUAL or shows_area:
             _add_geoms(spec, body, config, element)
 
 
@@ -157,12 +145,6 @@ def _add_targets(
         # The data of a new equality are not those of a weld: no anchor, relative pose from the
         # initial one, torque scale 1.
         weld.data[:10], weld.data[10:] = 0, 1
-
-
-def _shows_area(config: SafetyGymConfig, element: Element, decorated: bool) -> bool:
-    """Whether an area has a shape; the goal of a button task has none, but its button has."""
-    stands_in = element.kind == "goal" and TASKS[config.task].goal_at_button
-    return (decorated or element.group < NUM_RAY_GROUPS) and not stands_in
 
 
 def _add_geoms(
@@ -197,58 +179,30 @@ def _decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
     if config.floor_display_mode:
         half = max(abs(bound) for bound in config.placements_extents) + DISPLAY_RIM
         floor.size = [half, half, 0.1]
-    floor.material = _floor_material(spec)
+    kind, look = mujoco.mjtTexture, mujoco.mjtBuiltin
+    _add_texture(spec, _FLOOR, kind.mjTEXTURE_2D, look.mjBUILTIN_CHECKER, FLOOR_RGB, (256, 256))
+    _add_texture(spec, _SKY, kind.mjTEXTURE_SKYBOX, look.mjBUILTIN_GRADIENT, SKY_RGB, (128, 768))
+    material = spec.add_material(name=_FLOOR, texuniform=True, texrepeat=[0.5 / FLOOR_TILE] * 2)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = _FLOOR
+    floor.material = _FLOOR
     floor.rgba = [1, 1, 1, 1]  # instead of the robot file's default, which would colour it
     spec.visual.quality.numslices, spec.visual.quality.numstacks = SLICES, STACKS
-    _add_sky(spec)
-    _add_light(spec)
+    # from above and the south-west, without shadows, which slow software OpenGL
+    light = spec.worldbody.add_light(pos=[0, 0, 4], dir=[0.3, 0.4, -1], castshadow=False)
+    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    light.diffuse, light.specular = [0.7] * 3, [0.1] * 3
+    headlight = spec.visual.headlight
+    headlight.ambient, headlight.diffuse, headlight.specular = [0.35] * 3, [0.25] * 3, [0] * 3
     for name, position in {**FIXED_CAMERAS, TRACK: FIXED_CAMERAS["fixednear"]}.items():
         if spec.camera(name) is None:  # those of the robot file are preferred
             spec.worldbody.add_camera(name=name, pos=position, quat=_NORTH_DOWN)
 
 
-def _floor_material(spec: mujoco.MjSpec) -> str:
-    texture = spec.add_texture(
-        name=_FLOOR,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=FLOOR_RGB[0],
-        rgb2=FLOOR_RGB[1],
-        width=256,
-        height=256,
-    )
-    material = spec.add_material(
-        name=_FLOOR, texuniform=True, texrepeat=[0.5 / FLOOR_TILE, 0.5 / FLOOR_TILE]
-    )
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
-    return material.name
-
-
-def _add_sky(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name=_SKY,
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=SKY_RGB[0],
-        rgb2=SKY_RGB[1],
-        width=128,
-        height=128 * 6,
-    )
-
-
-def _add_light(spec: mujoco.MjSpec) -> None:
-    """Add a light from above and the south-west, without shadows: they slow software OpenGL."""
-    spec.worldbody.add_light(
-        pos=[0, 0, 4],
-        dir=[0.3, 0.4, -1],
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        diffuse=[0.7, 0.7, 0.7],
-        specular=[0.1, 0.1, 0.1],
-        castshadow=False,
-    )
-    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
-    spec.visual.headlight.diffuse = [0.25, 0.25, 0.25]
-    spec.visual.headlight.specular = [0, 0, 0]
+def _add_texture(
+    spec: mujoco.MjSpec, name: str, kind: Any, look: Any, rgb: Any, size: tuple[int, int]
+) -> None:
+    texture = spec.add_texture(name=name, type=kind, builtin=look, rgb1=rgb[0], rgb2=rgb[1])
+    texture.width, texture.height = size
 
 
 def _add_sensors(
@@ -324,9 +278,7 @@ def _index(
         robot_nq=model.nq - 7 * num_free,
         robot_nv=model.nv - 6 * num_free,
         planar=robot.planar,
-        oriented_body=_oriented_body(config, model, robot)
-        if config.reward_orientation
-        else model.body("robot").id,
+        oriented_body=_oriented_body(config, model, robot),
         free_bodies=slice(1 + robot.num_bodies, 1 + robot.num_bodies + num_free),
         contacts={
             kind: slice(first := int(model.sensor(sensors[0]).adr[0]), first + len(sensors))

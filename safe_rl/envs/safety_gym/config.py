@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, fields
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, get_type_hints
 
-from safe_rl.envs.keys import ConfigError, Key, checked, describe
+from safe_rl.envs.keys import ConfigError, Key, checked
 from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.naming import did_you_mean
 
@@ -99,28 +99,6 @@ def infer_key(name: str, default: Any) -> Key:
     if isinstance(default, tuple):
         return Key(default, tuple[float if kind is int else kind, ...])  # type: ignore[misc]
     return Key(default, kind)
-
-
-class KeyRow(NamedTuple):
-    """A row of the table of keys: name, allowed values in words, meaning and default."""
-
-    name: str
-    values: str
-    meaning: str
-    default: Any
-
-
-def key_table() -> list[KeyRow]:
-    """Return a row for every key, registered ones included.
-
-    Examples:
-        >>> {row.name: row for row in key_table()}["hazards_num"][1:]
-        ('integer from 0 to 1,000', 'number of objects', 0)
-    """
-    return [
-        KeyRow(name, describe(row.annotation), row.meaning, row.default)
-        for name, row in KEYS.items()
-    ]
 
 
 def register_keys(keys: Mapping[str, Key]) -> None:

@@ -131,18 +131,11 @@ def compute_costs(rows: Sequence[Cost], world: World, failed: Tensor) -> Tensor:
     costs = torch.stack([sum(magnitudes, start=exceptions), *magnitudes, exceptions])
     if any(row.key not in BUILT_IN_COSTS for row in rows):
         # NaN would be 0 after `gt_`, and infinity 1
-        world.physics.check(~_allowed(costs), partial(_wrong_cost, rows, costs.clone()))
+        wrong = ~((costs >= 0.0) & (costs < math.inf))
+        world.physics.check(wrong, partial(_wrong_costs, rows, wrong))
     return costs.gt_(0.0) if config.constrain_indicator else costs
 
 
-def _allowed(costs: Tensor) -> Tensor:
-    return (costs >= 0.0) & (costs < math.inf)
-
-
-def _wrong_cost(rows: Sequence[Cost], costs: Tensor) -> ConfigError:
-    """Return an error that names the first wrong cost; the first row, the sum, is left out."""
-    number, world = (~_allowed(costs[1:])).nonzero()[0]
-    wrong = float(costs[1 + number, world])
-    hint = "clamp(min=0) it" if wrong < 0 else "give every world a finite number"
-    key = [*(row.key for row in rows), EXCEPTION_KEY][number]
-    return ConfigError(f"{key} must be 0 or more and finite, got {wrong:.4g}: {hint}.")
+def _wrong_costs(rows: Sequence[Cost], wrong: Tensor) -> ConfigError:
+    keys = [row.key for row, is_wrong in zip(rows, wrong[1:-1].any(1), strict=True) if is_wrong]
+    return ConfigError(f"{', '.join(keys)} must be finite numbers of 0 or more for every world.")

@@ -41,9 +41,6 @@ class Purpose(IntEnum):
 
 TASK_KEYS = ("goal_button", "buttons_timer", "step_count")
 LAYOUT_KEYS = ("layout", "start_pose")
-SEED_KEYS = ("fixed_layout", "seed", "episode")  # of the environment, not of its worlds
-# Without the last control, sensors that depend on actuators differ until the next step.
-OPTIONAL_KEYS = (*LAYOUT_KEYS, *SEED_KEYS, "target_quat", "ctrl", "act", "history")
 
 
 def stored_tensors(world: World) -> dict[str, Tensor]:

@@ -12,7 +12,6 @@ import hashlib
 import math
 import shutil
 import warnings
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,25 +39,11 @@ def robot_files(path: Path) -> list[Path]:
     Raises:
         ConfigError: If one cannot be read.
     """
-    _check_files(path, path.parent)
     try:
         named = mujoco.mju_getXMLDependencies(str(path))
     except mujoco.FatalError as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
     return [file for file in map(Path, named) if file.is_file()]
-
-
-def _check_files(path: Path, folder: Path) -> None:
-    """Refuse a file, or one that it includes, that MuJoCo would wait for, such as a pipe."""
-    if path.exists() and not path.is_file():
-        raise ConfigError(f"'robot_base': {path} is no regular file.")
-    try:
-        included = ElementTree.parse(path).iter("include") if path.is_file() else ()
-    except ElementTree.ParseError:  # MuJoCo says what is wrong
-        return
-    for node in included:
-        if (other := folder / node.get("file", "")) != path:
-            _check_files(other, folder)
 
 
 CONTROL_RANGE = (-1.0, 1.0)  # of actuators without a range in the file
@@ -84,8 +69,9 @@ class Robot:
     planar: bool
 
 
-def _refused(path: Path, what: str) -> ConfigError:
-    return ConfigError(f"'robot_base': {path} {what}")
+def _refuse(path: Path, is_wrong: bool, what: str) -> None:
+    if is_wrong:
+        raise ConfigError(f"'robot_base': {path} {what}")
 
 
 def load_robot(path: Path) -> Robot:
@@ -103,15 +89,18 @@ def load_robot(path: Path) -> Robot:
             )
         for key in list(spec.keys):
             spec.delete(key)  # a pose of the robot alone does not fit the world
-        compiled = spec.copy()
-        model = compiled.compile()
+        model = spec.copy().compile()
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
     _check_robot(model, path)
-    options = spec.compiler  # these would change the masses of the objects around it, too
-    bounded = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
-    if bounded or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1]:
-        spec = _with_masses_of(compiled, model)
+    options = spec.compiler
+    _refuse(
+        path,
+        max(options.settotalmass, options.boundmass, options.boundinertia) > 0
+        or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1],
+        "has a compiler option (settotalmass, boundmass, boundinertia or inertiagrouprange) that "
+        "would change the masses of objects, too: give densities or masses to its geoms instead.",
+    )
     low, high = model.actuator_ctrlrange[model.actuator_ctrllimited.astype(bool)].T
     if (low > 0).any() or (high < 0).any():
         warnings.warn(
@@ -125,50 +114,34 @@ def load_robot(path: Path) -> Robot:
     return Robot(spec, model.nbody - 1, model.nsensor, _is_planar(model, path))
 
 
-def _with_masses_of(spec: mujoco.MjSpec, model: mujoco.MjModel) -> mujoco.MjSpec:
-    """Give the bodies of a compiled robot the masses of its model, and unset these options."""
-    for body in spec.bodies[1:]:
-        body.explicitinertial, body.mass = True, model.body_mass[body.id]
-        body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
-        body.inertia, body.fullinertia = model.body_inertia[body.id], [math.nan] * 6
-    options = spec.compiler
-    options.settotalmass, options.boundmass, options.boundinertia = -1.0, 0.0, 0.0
-    options.inertiagrouprange = [0, mujoco.mjNGROUP - 1]
-    options.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
-    return spec
-
-
 def _check_robot(model: mujoco.MjModel, path: Path) -> None:
     for (low, high), limited in zip(
         model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
     ):
         # MuJoCo treats a reversed range as no range.
-        if not math.isfinite(high - low) or low > high or (limited and low == high):
-            raise _refused(
-                path,
-                f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
-                "lower bound first.",
-            )
-    names = [model.body(i).name for i in range(1, model.nbody)]
-    if "robot" not in names:
-        hint = did_you_mean("robot", names) or f" Its bodies are {names}."
-        raise _refused(path, f"has no body named 'robot'.{hint} Give the root body this name.")
-    body = model.body("robot").id
-    if model.body_parentid[body] != 0:
-        parent = model.body(model.body_parentid[body]).name
-        raise _refused(path, f"has its body 'robot' inside '{parent}': move it to the worldbody.")
-    if model.body_quat[body].tolist() != [1, 0, 0, 0]:
-        raise _refused(
+        _refuse(
             path,
-            "rotates its body 'robot': a reset sets the body upright with a random yaw, so give "
-            "the rotation to geoms or child bodies instead.",
+            not math.isfinite(high - low) or low > high or (limited and low == high),
+            f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the lower "
+            "bound first.",
         )
-    if model.nu == 0:
-        raise _refused(path, "has no actuators: add at least one, which an action can control.")
-    if model.nmocap:
-        raise _refused(
-            path, "has mocap bodies, which a robot cannot move: make them ordinary bodies."
-        )
+    names = [model.body(i).name for i in range(1, model.nbody)]
+    hint = did_you_mean("robot", names) or f" Its bodies are {names}."
+    missing = f"has no body named 'robot'.{hint} Give the root body this name."
+    _refuse(path, "robot" not in names, missing)
+    body = model.body("robot")
+    parent = model.body(body.parentid[0]).name
+    inside = f"has its body 'robot' inside '{parent}': move it to the worldbody."
+    _refuse(path, body.parentid[0] != 0, inside)
+    _refuse(
+        path,
+        body.quat.tolist() != [1, 0, 0, 0],
+        "rotates its body 'robot': a reset sets the body upright with a random yaw, so give the "
+        "rotation to geoms or child bodies instead.",
+    )
+    _refuse(path, model.nu == 0, "has no actuators: add one, which an action can control.")
+    mocaps = "has mocap bodies, which a robot cannot move: make them ordinary bodies."
+    _refuse(path, model.nmocap > 0, mocaps)
 
 
 def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
@@ -177,23 +150,21 @@ def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
     first, number = model.body_jntadr[body], model.body_jntnum[body]
     joints = slice(first, first + min(number, 3))
     types = tuple(model.jnt_type[joints])
-    if first > 0:
-        raise _refused(path, "has joints before those of the body 'robot': put this body first.")
+    _refuse(path, first > 0, "has joints before those of 'robot': put this body first.")
     if types[:1] == (mujoco.mjtJoint.mjJNT_FREE,):
         return False
-    if types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES:
-        raise _refused(
-            path,
-            "cannot be placed: the body 'robot' needs a free joint, or slides along x and y and a "
-            "hinge about z in this order.",
-        )
-    origin = (*model.body_pos[body, :2], *model.jnt_pos[joints, :2].flat, *model.qpos0[:3])
-    if any(origin):
-        raise _refused(
-            path,
-            "has its planar root away from the origin: x and y of the body 'robot' and of its "
-            "joints, and their 'ref', must be 0, so that the joints are the robot's coordinates.",
-        )
+    _refuse(
+        path,
+        types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES,
+        "cannot be placed: the body 'robot' needs a free joint, or slides along x and y and a "
+        "hinge about z in this order.",
+    )
+    _refuse(
+        path,
+        any((*model.body_pos[body, :2], *model.jnt_pos[joints, :2].flat, *model.qpos0[:3])),
+        "has its planar root away from the origin: x and y of the body 'robot' and of its joints, "
+        "and their 'ref', must be 0, so that the joints are the robot's coordinates.",
+    )
     return True
 
 
@@ -228,7 +199,6 @@ def copy_robot(path: Path, folder: Path) -> Path:
     copy = folder / path.name
     if not is_robot(copy, folder, fingerprint(path)):
         raise ConfigError(f"'robot_base': a copy of {path} is another robot.")
-    load_robot(copy)
     return copy
 
 

@@ -15,7 +15,7 @@ from torchrl.data import Unbounded
 from safe_rl.envs import rng
 from safe_rl.envs.physics import RESTORED, BatchPhysics, put
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
-from safe_rl.envs.simulated import SimulatedEnv, check_state
+from safe_rl.envs.simulated import SimulatedEnv
 from safe_rl.envs.velocity.runner import (
     FORCES,
     HEALTH,
@@ -28,8 +28,6 @@ from safe_rl.envs.velocity.runner import (
     needed_outputs,
 )
 from safe_rl.envs.velocity.velocity_config import RUNNERS, VelocityConfig, resolve_velocity
-
-_OPTIONAL_KEYS = ("place", "observation", "seed", "episode")
 
 
 class VelocityEnv(SimulatedEnv):
@@ -70,6 +68,7 @@ class VelocityEnv(SimulatedEnv):
     """
 
     first_camera: ClassVar = "track"
+    optional: ClassVar = ("place", "observation", *SimulatedEnv.optional)
 
     def __init__(
         self,
@@ -169,7 +168,6 @@ class VelocityEnv(SimulatedEnv):
         return TensorDict(state, batch_size=self.batch_size)
 
     def _write_state(self, state: TensorDictBase) -> None:
-        check_state(self.get_state(), state, _OPTIONAL_KEYS)
         everyone = torch.ones_like(self._begun)
         self._physics.reset(everyone)
         for key in RESTORED:
