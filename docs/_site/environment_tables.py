@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -30,7 +29,11 @@ COMPONENTS = {
     "ballquat_.*": ("1", "rotation matrix of a ball joint, 3 × 3", "sensors_ball_joints"),
     "jointvel_.*": ("rad/s", "speed of a hinge", "sensors_hinge_joints"),
     "jointpos_.*": ("1", "sine and cosine of a hinge's angle", "sensors_hinge_joints"),
-    ".*_lidar": ("1", "closeness of the nearest, by direction", "observe_<kind>, lidar_num_bins"),
+    ".*_lidar": (
+        "1",
+        "0 to 1: closeness of the nearest",
+        "observe_<kind>, lidar_num_bins",
+    ),
     ".*_compass": ("1", "unit vector in the robot's frame", "observe_goal_comp, observe_box_comp"),
     "goal_dist": ("1", "e to the minus distance to the goal [m]", "observe_goal_dist"),
     "remaining": ("1", "share of the episode's steps taken so far", "observe_remaining"),
@@ -39,7 +42,7 @@ COMPONENTS = {
     "freejoint": ("m, 1", "position and quaternion of a free root", "observe_freejoint"),
     "qpos": ("m, rad, 1", "positions of all joints (`qpos` of MuJoCo)", "observe_qpos"),
     "qvel": ("m/s, rad/s", "velocities of all joints (`qvel` of MuJoCo)", "observe_qvel"),
-    "vision": ("1", "image of the robot's camera, height × width × 3", "observe_vision"),
+    "vision": ("1", "0 to 1: camera image, height × width × 3", "observe_vision"),
 }
 COST_MEANINGS = {
     "cost": "any of the others is",
@@ -126,23 +129,21 @@ def _words(schema: Mapping[str, Any]) -> str:
 
 
 def observations() -> str:
-    """Components of the observation: sizes, ranges, units, meaning."""
-    found: dict[str, tuple[int, tuple[float, float], set[str]]] = {}
+    """Components of the observation: sizes, units, meaning."""
+    found: dict[str, tuple[int, set[str]]] = {}
     for label, env in _observed():
         for name, columns in env.observation_layout.items():
-            known = (columns.stop - columns.start, env.observation_bounds[name], set[str]())
-            found.setdefault(name, known)[2].add(label)
+            known = (columns.stop - columns.start, set[str]())
+            found.setdefault(name, known)[1].add(label)
     rows = []
     for pattern, (unit, meaning, told) in COMPONENTS.items():
         for shown, group in _alike([name for name in found if component_of(name) == pattern]):
-            size, (low, high), _ = found[group[0]]
-            bound = "any" if math.isinf(high) else f"[{low:g}, {high:g}]"
             flags = ", ".join(f"`{key}`" for key in told.split(", ") if key)
-            who = set().union(*(found[name][2] for name in group))
+            who = set().union(*(found[name][1] for name in group))
             everyone = "any" in who or len(who) == len(_NAMES)
             of = "all" if everyone else ", ".join(name for name in _NAMES if name in who)
-            rows.append((f"`{shown}`", size, bound, unit, meaning, flags, of))
-    return table(["component", "size", "range", "unit", "meaning", "keys", "robots"], rows)
+            rows.append((f"`{shown}`", found[group[0]][0], unit, meaning, flags, of))
+    return table(["component", "size", "unit", "meaning", "keys", "robots"], rows)
 
 
 def component_of(name: str) -> str:

@@ -150,6 +150,8 @@ class Pictures(ABC):
     ) -> np.ndarray:
         """Draw `data` with markers and labels of bodies: RGB, uint8 [height, width, 3].
 
+        Markers beyond the capacity of MuJoCo's scene are left out.
+
         Raises:
             ValueError: For an unknown camera.
             OpenGLError: If OpenGL is missing or cannot be started.
@@ -166,7 +168,12 @@ class Pictures(ABC):
         chosen = self.free_camera() if isinstance(camera, str) and camera == FREE else camera
         renderer.update_scene(self.data, chosen, self.options)
         self._label(renderer.scene, set(labels))
-        add_markers(renderer.scene, markers)
+        drawn, upright = renderer.scene, np.eye(3).reshape(-1)
+        for marker in list(markers)[: drawn.maxgeom - drawn.ngeom]:
+            size, rgba = np.array(marker.size), np.array(marker.rgba, dtype=np.float32)
+            geom = drawn.geoms[drawn.ngeom]
+            mujoco.mjv_initGeom(geom, marker.type, size, marker.pos, upright, rgba)
+            drawn.ngeom += 1
         return renderer.render()
 
     def close(self) -> None:
@@ -184,18 +191,6 @@ class Pictures(ABC):
             if name in left:
                 geom.label = name
                 left.remove(name)
-
-
-def add_markers(drawn: mujoco.MjvScene, markers: Iterable[Marker]) -> None:
-    """Append markers to MuJoCo's scene; those beyond its capacity are left out."""
-    upright = np.eye(3).reshape(-1)
-    for marker in markers:
-        if drawn.ngeom == drawn.maxgeom:
-            return
-        geom = drawn.geoms[drawn.ngeom]
-        rgba = np.array(marker.rgba, dtype=np.float32)
-        mujoco.mjv_initGeom(geom, marker.type, np.array(marker.size), marker.pos, upright, rgba)
-        drawn.ngeom += 1
 
 
 def resize(picture: np.ndarray, width: int, height: int) -> np.ndarray:

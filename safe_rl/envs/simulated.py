@@ -18,8 +18,8 @@ from safe_rl.envs.contract import ConstrainedEnv
 from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, checked
 from safe_rl.envs.physics import OUTPUTS, BatchPhysics, Physics
 from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
-from safe_rl.envs.physics.warp_backend import make_warp_physics
 from safe_rl.envs.pictures import chosen_rows
+from safe_rl.extras import require_extra
 
 
 class SimulatedEnv(ConstrainedEnv):
@@ -87,6 +87,9 @@ class SimulatedEnv(ConstrainedEnv):
                 f"'{next(iter(ranges))}' is a range, which 'physics' warp does not have: use "
                 "'physics' cpu, or one factor."
             )
+        require_extra("mujoco_warp", extra="gpu")
+        from safe_rl.envs.physics.warp_physics import make_warp_physics
+
         return make_warp_physics(self, model, outputs)
 
     def _announce(
@@ -98,6 +101,7 @@ class SimulatedEnv(ConstrainedEnv):
         """
         physics = self._physics
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
+        self._row_seed = torch.zeros_like(self._episode)
         self._has_cost = torch.zeros_like(self._episode, dtype=torch.bool)
         self._begun = self._has_cost.clone()
         low, high = torch.from_numpy(model.actuator_ctrlrange.T.copy())
@@ -120,11 +124,6 @@ class SimulatedEnv(ConstrainedEnv):
         self.done_spec = Composite(**ends, shape=batch)
         self.set_seed(int(torch.randint(2**62, ())) if seed is None else seed)
 
-    @property
-    def observation_bounds(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of named components in `observation`; others have none."""
-        return {}
-
     def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
         """Seed every world separately, [N]: it gets the episodes of row 0 of an environment.
 
@@ -136,17 +135,14 @@ class SimulatedEnv(ConstrainedEnv):
         if len(seeds) != self.batch_size[0]:
             raise ValueError(f"There must be {self.batch_size[0]} seeds, got {len(seeds)}.")
         for row, seed in enumerate(seeds):
-            if seed is not None:
-                checked("seed", Seed, seed)
-                self._row_seed[row] = rng.row_seeds(seed, 1)[0]
-                self._episode[row] = 0
+            self._set_seed(seed, slice(row, row + 1))
 
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is None:
-            return
-        seed = checked("seed", Seed, seed)
-        self._row_seed = rng.row_seeds(seed, self.batch_size[0], self._physics.device)
-        self._episode.zero_()
+    def _set_seed(self, seed: int | None, rows: slice = slice(None)) -> None:
+        if seed is not None:
+            seed = checked("seed", Seed, seed)
+            number = len(self._episode[rows])
+            self._row_seed[rows] = rng.row_seeds(seed, number, self._physics.device)
+            self._episode[rows] = 0
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase | None = None, **others: Any) -> TensorDictBase:

@@ -258,11 +258,9 @@ def test_robots_with_other_masks_stand_on_the_floor_and_touch_objects(make, mask
     assert rollout["next", "cost_pillars"][:, 0].all()
 
 
-def test_keyframes_and_ranges_without_0_are_told(make):
+def test_keyframes_are_told(make):
     with pytest.warns(UserWarning, match="keyframes of .* are not used"):
         make(BALL)
-    with pytest.warns(UserWarning, match="action 0 is outside the control range"):
-        make(changed(DISC, 'ctrlrange="-0.5 2"', 'ctrlrange="0.5 2"'))
 
 
 @pytest.mark.parametrize(

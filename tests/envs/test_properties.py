@@ -113,7 +113,7 @@ def configurations(draw) -> dict:
     return config
 
 
-@pytest.mark.filterwarnings("ignore:.*has no effect")  # kinds without objects, idle boundaries
+@pytest.mark.filterwarnings("ignore:.*has no effect")  # kinds without objects
 @often
 @given(configurations(), st.booleans(), st.integers(0, 2**31))
 def test_valid_configurations_work(config, sleep, seed):

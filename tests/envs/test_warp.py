@@ -141,13 +141,6 @@ def test_the_observation_of_a_robot_whose_physics_failed_has_numbers():
     assert step["reward"][1] == 0.0
 
 
-def test_rays_see_what_mujoco_sees():
-    cpu, warp = pair("PointGoal1", lidar_type="natural")
-    torch.testing.assert_close(
-        cpu.reset()["observation"], warp.reset()["observation"], atol=1e-4, rtol=1e-4
-    )
-
-
 def test_graphs_replay_what_is_launched_one_by_one():
     graphs, eager = (pair("PointGoal1")[1] for _ in range(2))
     eager._physics.use_graphs = False
@@ -188,7 +181,7 @@ def looks_of_an_epoch(directory, num_steps, algo):
     )
     seed_everything(config.seed, 1)
     env = make_env(OmegaConf.to_container(config.env, resolve=True), num_envs=4, num_threads=1)
-    env._physics.waits, env._physics._late.look = True, lambda: None
+    env._physics.waits, env._physics._look = True, lambda: None
     trainer = build_trainer(config, env, directory)
     batches = iter(trainer.collector)
     trainer.epoch(batches)
@@ -280,7 +273,7 @@ def test_a_failure_is_reported_and_leaves_the_others_alone(two):
     assert physics.step(3).tolist() == [False, False]
 
 
-def test_each_simulation_takes_its_own_number_of_substeps(two):
+def test_mocap_bodies_follow_a_path(two):
     model, physics = two
     everywhere = torch.ones(2, dtype=torch.bool)
     path = torch.linspace(0, 1, 4 * physics.mocap_pos[0].numel()).view(1, 4, -1, 3)
@@ -288,9 +281,7 @@ def test_each_simulation_takes_its_own_number_of_substeps(two):
     for simulations in (cpu, physics):
         simulations.reset(everywhere)
         simulations.ctrl.fill_(0.5)
-        simulations.step(
-            4, path.expand(2, -1, -1, -1).to(simulations.dtype), counts=torch.tensor([4, 1])
-        )
+        simulations.step(4, path.expand(2, -1, -1, -1).to(simulations.dtype))
     for name in ("time", "qpos", "mocap_pos"):
         got, wanted = getattr(physics, name).double(), getattr(cpu, name)
         torch.testing.assert_close(got, wanted, atol=1e-3, rtol=1e-3)
@@ -312,6 +303,9 @@ def test_what_warp_lacks_is_refused(tmp_path):
         SafetyGymEnv(BUSY | {"robot_base": str(robot), "physics": "warp"})
     with pytest.raises(ConfigError, match="'physics' warp runs on the devices cpu and cuda"):
         SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), device="meta")
+    for keys in ({"lidar_type": "natural"}, {"frameskip_binom_p": 0.9}):
+        with pytest.raises(ConfigError, match=r"'lidar_type' natural and .* need 'physics' cpu"):
+            SafetyGymEnv(BUSY | {"physics": "warp", **keys})
     with pytest.raises(ConfigError, match="physics=jax: it must be 'cpu' or 'warp'"):
         SafetyGymEnv({"physics": "jax"})
 

@@ -12,7 +12,7 @@ import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Dict
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 
 from safe_rl.envs.keys import COST, ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
@@ -96,18 +96,12 @@ class Worlds:
 
     def spaces(self) -> tuple[gymnasium.Space, Box]:
         """Spaces of one environment's observation (by name if it is nested) and action."""
-        seen, bounds = self.batch.observation_spec["observation"], self.batch.observation_bounds
+        seen = self.batch.observation_spec["observation"]
         ends = self.batch.action_spec.space
         actions = Box(ends.low[0].cpu().numpy(), ends.high[0].cpu().numpy(), dtype=np.float32)
         if isinstance(seen, Composite):
-            parts: dict[str, gymnasium.Space] = {
-                n: Box(*bounds[n], part.shape[1:], np.float32) for n, part in seen.items()
-            }
-            return Dict(parts), actions
-        low, high = np.empty((2, seen.shape[-1]), np.float32)
-        for name, columns in self.batch.observation_layout.items():
-            low[columns], high[columns] = bounds.get(name, (-np.inf, np.inf))
-        return Box(low, high, dtype=np.float32), actions
+            return Dict({name: _any_numbers(part) for name, part in seen.items()}), actions
+        return _any_numbers(seen), actions
 
     def _seed(self, seed: Any, generator: np.random.Generator) -> None:
         """Seed all later episodes; without a seed, the first call draws one."""
@@ -150,6 +144,10 @@ class Worlds:
     def _positions(self) -> dict[str, Any]:
         """Present positions by kind [N, K, 3] (m) under `positions`; empty if not wanted."""
         return {"positions": arrays_of(self.batch.get_positions())} if self._has_positions else {}
+
+
+def _any_numbers(spec: TensorSpec) -> Box:
+    return Box(-np.inf, np.inf, spec.shape[1:], np.float32)
 
 
 def batch_of(

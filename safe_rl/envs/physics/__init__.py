@@ -92,6 +92,7 @@ class Physics(ABC):
             mocap_path: Mocap positions before each substep [N, S, nmocap, 3]; None if they do not
                 change.
             counts: A number of substeps for each simulation, at most S, int64 [N]; None means S.
+                Only on the CPU.
             refresh: Whether the outputs are those of the state that is reached. If not, they stay
                 as `mj_step` leaves them: those of the last state that the last substep evaluated,
                 with the Runge-Kutta integrator its fourth stage.
@@ -101,9 +102,8 @@ class Physics(ABC):
             again, but meaningless until a reset.
         """
 
-    @abstractmethod
     def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
-        """Cast rays into the simulations as their state is now.
+        """Cast rays into the simulations as their state is now, only on the CPU.
 
         Args:
             origin: Where the rays of each simulation start [N, 3] (m).
@@ -114,6 +114,7 @@ class Physics(ABC):
         Returns:
             Distance to the first surface [N, R] (m), -1 where there is none.
         """
+        raise NotImplementedError
 
     def maybe_any(self, mask: Tensor) -> bool:
         """Whether a mask may be True anywhere; True if the host would have to wait to know.

@@ -38,14 +38,13 @@ def runge_kutta_substep(physics: BatchPhysics) -> Tensor:
 
     Args:
         physics: Simulations with the output `qacc`. The model is a tree of hinges and slides
-            without activations; its first joint may be free.
+            without activations; its first joint is free.
 
     Returns:
         bool [N]: simulations that failed; they are in the model's initial state.
     """
-    step, free = physics.timestep, physics.qpos.shape[-1] == physics.qvel.shape[-1] + 1
     qpos, qvel, time = physics.qpos.clone(), physics.qvel.clone(), physics.time.clone()
-    root = _Root(qpos[:, 3:7]) if free else None
+    step, root = physics.timestep, _Root(qpos[:, 3:7])
     physics.forward(sensors=False)
     travels, accelerations = [qvel], [physics.outputs["qacc"].clone()]
     for part in _STAGES:
@@ -55,8 +54,7 @@ def runge_kutta_substep(physics: BatchPhysics) -> Tensor:
         physics.forward(sensors=part == 1.0)
         accelerations.append(physics.outputs["qacc"].clone())
         travels.append(physics.qvel.clone())
-        if root is not None:
-            root.pull_back_(travels[-1][:, 3:6])
+        root.pull_back_(travels[-1][:, 3:6])
     physics.qacc_warmstart.copy_(accelerations[-1])
     _move(physics.qpos, qpos, _average(travels), step, root)
     torch.add(qvel, _average(accelerations), alpha=step, out=physics.qvel)
@@ -68,11 +66,8 @@ def _average(stages: list[Tensor]) -> Tensor:
     return (second + third).mul_(2.0).add_(first).add_(fourth).div_(6.0)
 
 
-def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _Root | None) -> None:
+def _move(moved: Tensor, qpos: Tensor, travel: Tensor, duration: float, root: _Root) -> None:
     """Write positions [N, nq] after a time at velocities [N, nv], as `mj_integratePos` does."""
-    if root is None:
-        torch.add(qpos, travel, alpha=duration, out=moved)
-        return
     torch.add(qpos[:, :3], travel[:, :3], alpha=duration, out=moved[:, :3])
     torch.add(qpos[:, 7:], travel[:, 6:], alpha=duration, out=moved[:, 7:])
     moved[:, 3:7] = root.turn(travel[:, 3:6], duration)

@@ -13,29 +13,10 @@ _VERTICAL = wp.constant(1e-6)
 
 
 @wp.kernel
-def follow_path(
-    path: wp.array3d(dtype=float),
-    substep: int,
-    counts: wp.array(dtype=int),
-    live: wp.array2d(dtype=float),
-):
-    """Copy the positions of a substep, in worlds that take it: path [N, S, K] -> live [N, K]."""
+def follow_path(path: wp.array3d(dtype=float), substep: int, live: wp.array2d(dtype=float)):
+    """Copy the positions of a substep: path [N, S, K] -> live [N, K]."""
     world, column = wp.tid()
-    if substep < counts[world]:
-        live[world, column] = path[world, substep, column]
-
-
-@wp.kernel
-def restore_rows(
-    counts: wp.array(dtype=int),
-    substep: int,
-    saved: wp.array2d(dtype=float),
-    live: wp.array2d(dtype=float),
-):
-    """Undo a substep in worlds that do not take it: saved [N, K] -> live [N, K]."""
-    world, column = wp.tid()
-    if substep >= counts[world]:
-        live[world, column] = saved[world, column]
+    live[world, column] = path[world, substep, column]
 
 
 @wp.kernel

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import functools
+import math
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -13,21 +15,25 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from safe_rl.envs.physics import ACTUATOR_STATE, OUTPUTS, STATE, Physics
+from safe_rl.envs.keys import ConfigError
+from safe_rl.envs.physics import ACTUATOR_STATE, OUTPUTS, STATE, BatchPhysics, Physics
 from safe_rl.envs.physics.warp_kernels import (
     align_capsules,
     find_failures,
     follow_path,
     note_overflow,
     reset_rows,
-    restore_rows,
 )
 
-_INTEGRATED = ("time", "qpos", "qvel", "qacc_warmstart", *ACTUATOR_STATE)  # what a substep changes
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
 _LOST_CONTACTS = int(_LOST.BROADPHASE | _LOST.NARROWPHASE | _LOST.CCD | _LOST.CONTACT_MATCH)
 _LOST_ROWS = int(_LOST.NEFC | _LOST.NJMAX_NNZ)
+
+# Size of the trial that counts contacts.
+TRIAL_WORLDS, TRIAL_STEPS = 32, 50
+_FEWEST_CONTACTS, _FEWEST_CONSTRAINTS = 32, 128
+_NEARLY = 1e-3  # margin of geoms in the trial [m], because contacts on the device differ a little
 
 
 class BufferOverflowError(RuntimeError):
@@ -77,7 +83,7 @@ class WarpPhysics(Physics):
         self._rooms = {"contacts": contacts, "constraints": constraints}
         self._graphs: dict[Hashable, wp.Graph] = {}
         self._paths: dict[int, Tensor] = {}
-        self._late = _LateChecks(self.device)
+        self._late: list[tuple[Tensor, Any, Callable[[], Exception]]] = []
         with wp.ScopedDevice(self._warp_device):
             self._model = mjw.put_model(model)
             if (model.geom_type == mujoco.mjtGeom.mjGEOM_CAPSULE).any():
@@ -109,12 +115,7 @@ class WarpPhysics(Physics):
         flat = {name: shared[name].view(num_envs, -1) for name in initial}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
-        self._saved: dict[str, Any] = {
-            name: wp.empty_like(self._rows[name]) for name in _INTEGRATED if name in flat
-        }
-        whole: dict[str, Any] = {"dtype": torch.int32, "device": self.device}
-        self._counts = torch.zeros(num_envs, **whole)
-        self._overflow = torch.zeros(2, **whole)
+        self._overflow = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._mask = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self._failed = self._mask.clone()
 
@@ -122,7 +123,7 @@ class WarpPhysics(Physics):
         """Compile and load all kernels before graphs are recorded, then reset everything."""
         self._mask.fill_(True)
         with self._launching():
-            self._substeps(1, None, True)
+            self._substeps(1, None)
             self._forward()
             self._reset(self._mask)
         # all objects were at one place here, so there were too many contacts
@@ -147,18 +148,15 @@ class WarpPhysics(Physics):
         refresh: bool = True,
     ) -> Tensor:
         """Advance by substeps and compute the outputs, see `Physics`."""
+        assert counts is None  # see `suite.check`
         path = None
-        if counts is None:
-            self._counts.fill_(num_substeps)
-        else:
-            self._counts.copy_(counts)
         if mocap_path is not None:
             columns = mocap_path.flatten(2)
             if num_substeps not in self._paths:
                 self._paths[num_substeps] = torch.empty_like(columns, dtype=self.dtype)
             path = self._paths[num_substeps].copy_(columns)
-        key = ("step", num_substeps, path is None, counts is None, refresh)
-        self._run(key, self._step, num_substeps, path, counts is not None, refresh)
+        key = ("step", num_substeps, path is None, refresh)
+        self._run(key, self._step, num_substeps, path, refresh)
         self._check_rooms()
         failed = self._failed.clone()
         self._failed.zero_()
@@ -167,35 +165,26 @@ class WarpPhysics(Physics):
                 output.masked_fill_(failed.view(-1, *[1] * (output.ndim - 1)), 0.0)
         return failed
 
-    def rays(self, origin: Tensor, directions: Tensor, group: int, exclude_body: int) -> Tensor:
-        """Cast rays into the simulations as their state is now, see `Physics`."""
-        num_envs, num_rays = directions.shape[:2]
-        real: dict[str, Any] = {"dtype": self.dtype, "device": self.device}
-        start = origin.to(self.dtype).unsqueeze(1).expand(-1, num_rays, -1).contiguous()
-        distance = torch.empty(num_envs, num_rays, **real)
-        normal = torch.empty(num_envs, num_rays, 3, **real)
-        hit = torch.empty(num_envs, num_rays, dtype=torch.int32, device=self.device)
-        excluded = torch.full((num_rays,), exclude_body, dtype=torch.int32, device=self.device)
-        seen = [int(number == group) for number in range(mujoco.mjNGROUP)]
-        with self._launching():
-            mjw.rays(
-                *(self._model, self._data, wp.from_torch(start, dtype=wp.vec3)),
-                wp.from_torch(directions.to(self.dtype).contiguous(), dtype=wp.vec3),
-                *(mjw._src.types.vec6(*seen), True, wp.from_torch(excluded)),
-                *(wp.from_torch(distance), wp.from_torch(hit)),
-                wp.from_torch(normal, dtype=wp.vec3),
-            )
-        return distance
-
     def check(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Raise an error if `wrong` is True anywhere, now or in a later call."""
-        if self.waits:
-            self._late.add(wrong.any(), error)
-        else:
+        """Raise an error if `wrong` is True anywhere, now or, on CUDA, in a later call."""
+        if not self.waits:
             super().check(wrong, error)
+            return
+        on_cuda = self.device.type == "cuda"
+        seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=on_cuda)
+        seen.copy_(wrong.any(), non_blocking=True)
+        done = torch.cuda.current_stream(self.device).record_event() if on_cuda else None
+        self._late.append((seen, done, error))
+
+    def _look(self) -> None:
+        """Raise the error of the first earlier check that has arrived and failed."""
+        while self._late and (self._late[0][1] is None or self._late[0][1].query()):
+            seen, _, error = self._late.pop(0)
+            if seen:
+                raise error()
 
     def _check_rooms(self) -> None:
-        self._late.look()
+        self._look()
         self.check(self._overflow > 0, self._no_room)
 
     def _no_room(self) -> BufferOverflowError:
@@ -230,8 +219,8 @@ class WarpPhysics(Physics):
         with self._launching():
             wp.capture_launch(self._graphs[key])
 
-    def _step(self, num_substeps: int, path: Tensor | None, differ: bool, refresh: bool) -> None:
-        self._substeps(num_substeps, path, differ)
+    def _step(self, num_substeps: int, path: Tensor | None, refresh: bool) -> None:
+        self._substeps(num_substeps, path)
         if not refresh and "cfrc_ext" in self.outputs:
             mjw.rne_postconstraint(self._model, self._data)
         failed = [wp.from_torch(self._failed)]
@@ -242,20 +231,12 @@ class WarpPhysics(Physics):
         self._reset(self._failed)
         self._forward() if refresh else self._note_overflow()
 
-    def _substeps(self, num_substeps: int, path: Tensor | None, differ: bool) -> None:
-        counts = wp.from_torch(self._counts)
+    def _substeps(self, num_substeps: int, path: Tensor | None) -> None:
         for substep in range(num_substeps):
             if path is not None:
                 live = self._rows["mocap_pos"]
-                wp.launch(follow_path, live.shape, [wp.from_torch(path), substep, counts], [live])
-            if differ:
-                for name, saved in self._saved.items():
-                    wp.copy(saved, self._rows[name])
+                wp.launch(follow_path, live.shape, [wp.from_torch(path), substep], [live])
             mjw.step(self._silent, self._data)
-            if differ:
-                for name, saved in self._saved.items():
-                    live = self._rows[name]
-                    wp.launch(restore_rows, live.shape, [counts, substep, saved], [live])
 
     def _forward(self) -> None:
         mjw.forward(self._model, self._data)
@@ -282,24 +263,60 @@ def _align_capsules(model: Any, data: Any) -> None:
     wp.launch(align_capsules, data.naconmax, inputs, [data.contact.frame])
 
 
-class _LateChecks:
-    """Conditions on a device. The host reads each one when it has arrived, and never waits."""
+def make_warp_physics(env: Any, model: mujoco.MjModel, outputs: Sequence[str]) -> Physics:
+    """Build the physics for the value "warp" of the key `physics`.
 
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._pending: list[tuple[Tensor, Any, Callable[[], Exception]]] = []
+    Args:
+        env: The environment; another one of its family makes a trial on the CPU.
+        model: Its compiled world.
+        outputs: Names of the fields of `MjData` that are read.
 
-    def add(self, wrong: Tensor, error: Callable[[], Exception]) -> None:
-        """Add a condition, bool []; `look` raises the error if it is True."""
-        on_cuda = self._device.type == "cuda"
-        seen = torch.empty((), dtype=torch.bool, device="cpu", pin_memory=on_cuda)
-        seen.copy_(wrong, non_blocking=True)
-        done = torch.cuda.current_stream(self._device).record_event() if on_cuda else None
-        self._pending.append((seen, done, error))
+    Raises:
+        ConfigError: If MuJoCo Warp does not support the robot, or for an unsupported device.
+    """
+    config, device, num_envs = env.config, env.device, env.batch_size[0]
+    if device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"'physics' warp runs on the devices cpu and cuda, got {device}.")
+    # a class of the user's may have another constructor
+    family: Any = next(c for c in type(env).__mro__ if c.__module__.startswith("safe_rl."))
+    most, scale = most_contacts(config, family), config.physics_buffers
+    contacts = _power_of_two(max(scale * most[0], _FEWEST_CONTACTS))
+    constraints = _power_of_two(max(scale * most[1], _FEWEST_CONSTRAINTS))
+    try:
+        return WarpPhysics(model, num_envs, device, contacts, constraints, outputs)
+    except (NotImplementedError, ValueError) as error:
+        raise ConfigError(
+            f"'physics' warp does not support the robot of this environment: {error} Use "
+            "'physics' cpu."
+        ) from error
 
-    def look(self) -> None:
-        """Raise the error of the first condition that has arrived and is True."""
-        while self._pending and (self._pending[0][1] is None or self._pending[0][1].query()):
-            seen, _, error = self._pending.pop(0)
-            if seen:
-                raise error()
+
+@functools.lru_cache(maxsize=64)
+def most_contacts(config: Any, env_class: Any) -> tuple[int, int]:
+    """Return the most contacts and constraint rows of a world in a trial of random actions."""
+
+    class Trial(env_class):
+        def _make_physics(
+            self, model: mujoco.MjModel, bodies: slice, num_threads: int, outputs: Any = OUTPUTS
+        ) -> Physics:
+            model = copy.copy(model)
+            model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+            model.geom_margin[:] += _NEARLY
+            counted = (*outputs, "ncon", "nefc")
+            return BatchPhysics(model, self.batch_size[0], num_threads, counted)
+
+    env = Trial(config.replace(physics="cpu"), TRIAL_WORLDS, seed=0)
+    env._begin(torch.ones(TRIAL_WORLDS, dtype=torch.bool))
+    generator = torch.Generator().manual_seed(0)
+    counts = [env._physics.outputs[name] for name in ("ncon", "nefc")]
+    highest = [int(count.max()) for count in counts]
+    low, high = env.action_spec.space.low, env.action_spec.space.high
+    for _ in range(TRIAL_STEPS):
+        env._advance(low + (high - low) * torch.rand(low.shape, generator=generator))
+        highest = [max(most, int(count.max())) for most, count in zip(highest, counts, strict=True)]
+    return highest[0], highest[1]
+
+
+def _power_of_two(number: float) -> int:
+    """Round up to a power of two, because kernels are compiled once for each size."""
+    return 1 << (math.ceil(number) - 1).bit_length()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
@@ -24,7 +24,6 @@ from safe_rl.envs.safety_gym.episodes import (
     gremlin_path,
     make_world,
     next_goals,
-    pick_layouts,
     place_mocaps,
     point_goal_at_button,
     refresh,
@@ -116,6 +115,7 @@ class SafetyGymEnv(SimulatedEnv):
         self._plan = plan_placements(scene, physics.device)
         draw = partial(draw_layouts, self._plan, physics)
         shape = (num_envs, self._plan.num_columns, 2)
+        self._fixed_layout = torch.zeros_like(self._world.step_count)
         self._layouts = rng.DrawnAhead(draw, shape, physics.device)
         vision = [vision_block(scene)] if self.config.observe_vision else []
         self._observer = make_observer(scene, physics.device, vision)
@@ -138,39 +138,30 @@ class SafetyGymEnv(SimulatedEnv):
         return self._world.scene.names
 
     @property
-    def observation_bounds(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of every named component in `observation`."""
-        return dict(self._observer.bounds)
-
-    @property
     def sensor_keys(self) -> dict[str, Any]:  # type: ignore[override]
         """Keys that change the readings of lidars, but not their number."""
         has_lidar = any(name.endswith("_lidar") for name in self.observation_layout)
         return {key: getattr(self.config, key) for key in _LIDAR if has_lidar}
 
-    def _set_seed(self, seed: int | None) -> None:
-        super()._set_seed(seed)
-        if seed is not None:
-            self._fixed_layout = self._layout_of(seed)
-
-    def set_row_seeds(self, seeds: Sequence[int | None]) -> None:
-        """Seed every world and its layout separately, [N]; None keeps the seed of a world."""
-        super().set_row_seeds(seeds)
-        self._fixed_layout = self._fixed_layout.expand(self.batch_size).clone()
-        for row, seed in enumerate(seeds):
-            if seed is not None:
-                self._fixed_layout[row] = self._layout_of(seed)
-
-    def _layout_of(self, seed: int) -> Tensor:
-        """Return the layout key of all rows of a seed, if `randomize_layout` is False."""
-        return rng.fold(torch.tensor(seed, device=self._physics.device), Purpose.LAYOUT)
+    def _set_seed(self, seed: int | None, rows: slice = slice(None)) -> None:
+        super()._set_seed(seed, rows)
+        if seed is not None:  # without `randomize_layout`, all rows have one layout
+            layout_seed = torch.tensor(seed, device=self._physics.device)
+            self._fixed_layout[rows] = rng.fold(layout_seed, Purpose.LAYOUT)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
-        """Return random keys of the layouts of the `ahead`-th next episodes, [N]."""
-        key = rng.fold(self._row_seed, self._episode + ahead)
-        if not self.config.randomize_layout:
-            key = self._fixed_layout.expand(self.batch_size)
-        return key if self.config.layout_seeds is None else pick_layouts(self.config, key)
+        """Return random keys of the layouts of the `ahead`-th next episodes, [N].
+
+        With `layout_seeds` they depend on one of these seeds only. So environments with other
+        seeds, and evaluations on the same set, have the same layouts.
+        """
+        config, key = self.config, self._fixed_layout
+        if config.randomize_layout:
+            key = rng.fold(self._row_seed, self._episode + ahead)
+        if config.layout_seeds is None:
+            return key
+        index = (rng.uniform(key, Purpose.LAYOUT_SEED) * config.layout_seeds).to(torch.int64)
+        return rng.fold(config.layout_seeds_first + index, Purpose.LAYOUT_SEED)
 
     def _step_key(self) -> Tensor:
         """Return random keys of the step that is being taken, [N]."""
@@ -274,7 +265,7 @@ class SafetyGymEnv(SimulatedEnv):
         )
         state["target_quat"] = world.physics.mocap_quat[:, : world.scene.num_targets]
         if not self.config.randomize_layout:
-            state["fixed_layout"] = self._fixed_layout.expand(self.batch_size)
+            state["fixed_layout"] = self._fixed_layout
         return TensorDict(state, batch_size=self.batch_size).clone()
 
     def _write_state(self, state: TensorDictBase) -> None:

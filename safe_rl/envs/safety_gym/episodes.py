@@ -156,17 +156,6 @@ def point_goal_at_button(world: World, mask: Tensor) -> None:
     put(world.positions[:, world.scene.slots["goal"].start], mask, button)
 
 
-def pick_layouts(config: SafetyGymConfig, key: Tensor) -> Tensor:
-    """Pick layouts uniformly from the finite set of `layout_seeds`: keys [N] -> layout keys [N].
-
-    A layout key depends only on the picked layout seed. So environments with other seeds, and
-    evaluations on the same set, have the same layouts.
-    """
-    assert config.layout_seeds is not None
-    index = (rng.uniform(key, Purpose.LAYOUT_SEED) * config.layout_seeds).to(torch.int64)
-    return rng.fold(config.layout_seeds_first + index, Purpose.LAYOUT_SEED)
-
-
 def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     """Draw the positions of robot and objects for episodes with keys [B]: [B, 1 + M, 2].
 

@@ -101,13 +101,6 @@ def load_robot(path: Path) -> Robot:
         "has a compiler option (settotalmass, boundmass, boundinertia or inertiagrouprange) that "
         "would change the masses of objects, too: give densities or masses to its geoms instead.",
     )
-    low, high = model.actuator_ctrlrange[model.actuator_ctrllimited.astype(bool)].T
-    if (low > 0).any() or (high < 0).any():
-        warnings.warn(
-            f"{path}: action 0 is outside the control range of an actuator, and is clipped to it. "
-            "Policies begin with actions around 0: shift the range by the actuator's parameters.",
-            stacklevel=2,
-        )
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
             actuator.ctrlrange, actuator.ctrllimited = CONTROL_RANGE, True

@@ -14,7 +14,6 @@ from typing import Any
 
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import PATHS_OF_2019, ROBOTS, SafetyGymConfig
-from safe_rl.envs.safety_gym.config_keys import LARGEST_SEED
 from safe_rl.envs.safety_gym.tasks import TASKS
 from safe_rl.naming import did_you_mean
 
@@ -127,13 +126,6 @@ EXTRAS: dict[str, Values] = _DEBUG_SUITE | {
 }
 
 
-# Keys that have no effect without another one.
-_NEEDED = {
-    **{"boundary_x": "constrain_boundary", "boundary_y": "constrain_boundary"},
-    **{"velocity_limit": "constrain_velocity", "layout_seeds_first": "layout_seeds"},
-}
-
-
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     """Return the checked configuration of a name, a mapping of keys, or a configuration.
 
@@ -152,11 +144,6 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         return check(env)
     if isinstance(env, Mapping):
         return check(SafetyGymConfig(**env))
-    if not isinstance(env, str):
-        raise ConfigError(
-            "An environment is given by its name, a mapping of keys, or a SafetyGymConfig; got a "
-            f"{type(env).__name__}."
-        )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
     named = SUITE | EXTRAS
     if name not in named:
@@ -187,20 +174,16 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
             f"'robot_base' must be one of {tuple(ROBOTS)} or the path of an MJCF (.xml) file, "
             f"got {robot!r}.{did_you_mean(robot, ROBOTS)}"
         )
-    if config.layout_seeds_first + (config.layout_seeds or 0) > LARGEST_SEED:
-        raise ConfigError(
-            f"'layout_seeds_first' and 'layout_seeds' together must be at most {LARGEST_SEED}, got "
-            f"{config.layout_seeds_first} and {config.layout_seeds}."
-        )
     if TASKS[config.task].goal_at_button and config.buttons_num < 1:
         raise ConfigError(f"'task' {config.task} needs at least one button: set 'buttons_num'.")
     if config.constrain_boundary and config.boundary_x is None and config.boundary_y is None:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
     if config.constrain_velocity and config.velocity_limit is None:
         raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
-    for name, needed in _NEEDED.items():
-        if getattr(config, name) and not getattr(config, needed):
-            warnings.warn(f"'{name}' has no effect: set '{needed}' too.", stacklevel=2)
+    if config.physics == "warp" and (
+        config.lidar_type == "natural" or config.frameskip_binom_p < 1.0
+    ):
+        raise ConfigError("'lidar_type' natural and 'frameskip_binom_p' < 1 need 'physics' cpu.")
     keys = vars(config)
     for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
         pinned, number = len(keys.get(f"{kind}_locations", ())), keys.get(f"{kind}_num", 1)
