@@ -92,8 +92,6 @@ def _advice(error: Exception) -> str:
     return f"{message}, then restart Python."
 
 
-FREE = "free"
-
 Camera: TypeAlias = str | mujoco.MjvCamera
 
 
@@ -120,8 +118,8 @@ class Pictures(ABC):
         """The model that is drawn."""
 
     @abstractmethod
-    def free_camera(self) -> mujoco.MjvCamera:
-        """Return the camera named "free"."""
+    def free_cameras(self) -> dict[str, mujoco.MjvCamera]:
+        """Return cameras for the present positions; cameras of the model precede them."""
 
     @cached_property
     def data(self) -> mujoco.MjData:
@@ -129,10 +127,11 @@ class Pictures(ABC):
         return mujoco.MjData(self.model)
 
     @property
-    def cameras(self) -> list[str]:
-        """Names of cameras that `frame` takes."""
-        named = [name for i in range(self.model.ncam) if (name := self.model.camera(i).name)]
-        return [*named, FREE]
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras that `frame` takes, by name."""
+        names = (self.model.camera(i).name for i in range(self.model.ncam))
+        named = {name: name for name in names if name}
+        return named | {n: each for n, each in self.free_cameras().items() if n not in named}
 
     def place(self) -> None:
         """Compute the poses of bodies, cameras and lights from the positions in `data`."""
@@ -156,23 +155,24 @@ class Pictures(ABC):
             ValueError: For an unknown camera.
             OpenGLError: If OpenGL is missing or cannot be started.
         """
-        if isinstance(camera, str) and camera not in self.cameras:
+        cameras = self.cameras
+        if isinstance(camera, str) and camera not in cameras:
             raise ValueError(
-                f"There is no camera '{camera}'.{did_you_mean(camera, self.cameras)} "
-                f"Choose one of {self.cameras}, or give a mujoco.MjvCamera."
+                f"There is no camera '{camera}'.{did_you_mean(camera, cameras)} "
+                f"Choose one of {[*cameras]}, or give a mujoco.MjvCamera."
             )
         size = (width, height)
         if size not in self._renderers:
             self._renderers[size] = open_renderer(self.model, width, height)
         renderer = self._renderers[size]
-        chosen = self.free_camera() if isinstance(camera, str) and camera == FREE else camera
+        chosen = cameras[camera] if isinstance(camera, str) else camera
         renderer.update_scene(self.data, chosen, self.options)
         self._label(renderer.scene, set(labels))
         drawn, upright = renderer.scene, np.eye(3).reshape(-1)
         for marker in list(markers)[: drawn.maxgeom - drawn.ngeom]:
-            size, rgba = np.array(marker.size), np.array(marker.rgba, dtype=np.float32)
+            extent, rgba = np.array(marker.size), np.array(marker.rgba, dtype=np.float32)
             geom = drawn.geoms[drawn.ngeom]
-            mujoco.mjv_initGeom(geom, marker.type, size, marker.pos, upright, rgba)
+            mujoco.mjv_initGeom(geom, marker.type, extent, marker.pos, upright, rgba)
             drawn.ngeom += 1
         return renderer.render()
 

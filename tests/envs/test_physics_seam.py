@@ -38,8 +38,6 @@ class WaitingPhysics(Physics):
         for name in STATE:
             setattr(self, name, getattr(self._batch, name).to(dtype, copy=True))
         self.outputs = {name: out.to(dtype, copy=True) for name, out in self._batch.outputs.items()}
-        for name in OUTPUTS:
-            setattr(self, name, self.outputs[name])
 
     def _call(self, method, *arguments):
         self.inside = True

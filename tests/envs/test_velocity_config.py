@@ -8,7 +8,7 @@ import pytest
 
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES
-from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityConfig, resolve_velocity
+from safe_rl.envs.velocity import VELOCITY_SUITE, resolve_velocity
 from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 OURS = {"robot", "velocity_threshold", "num_steps", "physics", "physics_buffers", *SCALES}
@@ -23,12 +23,6 @@ def test_keys_and_defaults_are_gymnasiums(name):
     defaults = {key: row.default for key, row in parameters.items() if key not in THEIRS}
     ours = {key: value for key, value in config.to_dict().items() if key not in OURS}
     assert ours == defaults
-
-
-def test_another_robot_brings_its_own_keys():
-    config = resolve_velocity("SafeHopperVelocity").replace(robot="ant", frame_skip=2)
-    assert config == VelocityConfig.from_dict({"robot": "ant", "frame_skip": 2})
-    assert config.healthy_angle_range is None
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ RESTORED = ("qpos", "qvel", "qacc_warmstart", "time")
 """Those of them that every stored state of an environment contains."""
 ACTUATOR_STATE = ("act", "history")
 OUTPUTS = ("xpos", "xmat", "sensordata", "subtree_com")
+"""Outputs that Safety Gym's worlds read."""
 
 
 class Physics(ABC):
@@ -46,9 +47,7 @@ class Physics(ABC):
         mocap_pos, mocap_quat: Poses of the mocap bodies [N, nmocap, 3] (m) and [N, nmocap, 4].
         actuator_state: State of filtered and delayed actuators and sensors, `act` [N, na] and
             `history` [N, nhistory]; without entries that the model does not need.
-        xpos, xmat, sensordata, subtree_com: The outputs, [N, nbody, 3] (m), [N, nbody, 3, 3],
-            [N, nsensordata] and [N, nbody, 3] (m).
-        outputs: All fields of `MjData` that are read, by name.
+        outputs: Fields of `MjData` that are read, by name, such as `xpos` [N, nbody, 3] (m).
     """
 
     device: torch.device
@@ -63,10 +62,6 @@ class Physics(ABC):
     mocap_pos: Tensor
     mocap_quat: Tensor
     actuator_state: Mapping[str, Tensor]
-    xpos: Tensor
-    xmat: Tensor
-    sensordata: Tensor
-    subtree_com: Tensor
     outputs: Mapping[str, Tensor]
 
     @abstractmethod
@@ -160,9 +155,6 @@ class BatchPhysics(Physics):
         num_envs: Number of simulations, N.
         num_threads: Threads that step them, 0 for one per core.
         outputs: Names of the fields of `MjData` that are read; every call copies them.
-
-    Attributes:
-        batch: MuJoCo's simulations.
     """
 
     device = torch.device("cpu")
@@ -200,8 +192,6 @@ class BatchPhysics(Physics):
         self.outputs = {name: bound[name] for name in outputs}
         if "xmat" in self.outputs:
             self.outputs["xmat"] = self.outputs["xmat"].view(num_envs, model.nbody, 3, 3)
-        for name in set(OUTPUTS).intersection(outputs):
-            setattr(self, name, self.outputs[name])
         self._disableflags = self.batch.expand("opt.disableflags")
         self._with_sensors = int(model.opt.disableflags)
         self._warnings = np.zeros_like(self.batch.warning)

@@ -17,13 +17,7 @@ from torch import Tensor
 
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics import ACTUATOR_STATE, OUTPUTS, STATE, BatchPhysics, Physics
-from safe_rl.envs.physics.warp_kernels import (
-    align_capsules,
-    find_failures,
-    follow_path,
-    note_overflow,
-    reset_rows,
-)
+from safe_rl.envs.physics import warp_kernels as kernels
 
 _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _LOST = mjw._src.types.OverflowType
@@ -104,10 +98,8 @@ class WarpPhysics(Physics):
     def _bind(self, model: mujoco.MjModel) -> None:
         """Share memory with torch, and store the initial state of a simulation."""
         data, num_envs = self._data, self._data.nworld
-        shared = {
-            name: wp.to_torch(getattr(data, name)) for name in (*STATE, *ACTUATOR_STATE, *OUTPUTS)
-        }
-        for name in (*STATE, *OUTPUTS):
+        shared = {name: wp.to_torch(getattr(data, name)) for name in (*STATE, *ACTUATOR_STATE)}
+        for name in STATE:
             setattr(self, name, shared[name])
         sizes = dict(zip(ACTUATOR_STATE, (model.na, model.nhistory), strict=True))
         self.actuator_state = {name: shared[name] for name in ACTUATOR_STATE if sizes[name]}
@@ -227,7 +219,7 @@ class WarpPhysics(Physics):
         for name in ("qpos", "qvel", "qacc_warmstart"):
             if name in self._rows:
                 row = self._rows[name]
-                wp.launch(find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
+                wp.launch(kernels.find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
         self._reset(self._failed)
         self._forward() if refresh else self._note_overflow()
 
@@ -235,7 +227,7 @@ class WarpPhysics(Physics):
         for substep in range(num_substeps):
             if path is not None:
                 live = self._rows["mocap_pos"]
-                wp.launch(follow_path, live.shape, [wp.from_torch(path), substep], [live])
+                wp.launch(kernels.follow_path, live.shape, [wp.from_torch(path), substep], [live])
             mjw.step(self._silent, self._data)
 
     def _forward(self) -> None:
@@ -246,21 +238,22 @@ class WarpPhysics(Physics):
         data = self._data
         lost = [data.overflow, _LOST_CONTACTS, _LOST_ROWS]
         wp.launch(
-            note_overflow,
+            kernels.note_overflow,
             data.nworld,
             [data.nacon, data.ncollision, data.nefc, data.naconmax, data.njmax, *lost],
             [wp.from_torch(self._overflow)],
         )
 
     def _reset(self, mask: Tensor) -> None:
+        chosen = wp.from_torch(mask)
         for name, live in self._rows.items():
-            wp.launch(reset_rows, live.shape, [wp.from_torch(mask), self._start[name]], [live])
+            wp.launch(kernels.reset_rows, live.shape, [chosen, self._start[name]], [live])
 
 
 def _align_capsules(model: Any, data: Any) -> None:
     """Give contacts of capsules on planes the same frames as MuJoCo."""
     inputs = [data.nacon, model.geom_type, data.contact.geom, data.contact.worldid, data.geom_xmat]
-    wp.launch(align_capsules, data.naconmax, inputs, [data.contact.frame])
+    wp.launch(kernels.align_capsules, data.naconmax, inputs, [data.contact.frame])
 
 
 def make_warp_physics(env: Any, model: mujoco.MjModel, outputs: Sequence[str]) -> Physics:

@@ -18,14 +18,7 @@ from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
 from safe_rl.envs.safety_gym.config import ROBOTS, SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import active_costs
-from safe_rl.envs.safety_gym.elements import (
-    ELEMENTS,
-    NUM_RAY_GROUPS,
-    PUSHED,
-    Element,
-    Geom,
-    Motion,
-)
+from safe_rl.envs.safety_gym.elements import ELEMENTS, NUM_RAY_GROUPS, PUSHED, Element, Geom, Motion
 from safe_rl.envs.safety_gym.observations import active_readings
 from safe_rl.envs.safety_gym.robots import Robot, load_robot
 from safe_rl.envs.safety_gym.tasks import TASKS
@@ -42,7 +35,6 @@ FLOOR_HALF_SIZE = 3.5  # visible part [m]; the plane itself is infinite
 _NORTH_DOWN = (math.cos(math.pi / 8), math.sin(math.pi / 8), 0.0, 0.0)
 # Fixed cameras: position in the world [m].
 FIXED_CAMERAS = {"fixednear": (0.0, -2.0, 2.0), "fixedfar": (0.0, -5.0, 5.0)}
-TRACK = "track"  # behind the robot, see `renderer`
 VISION = "vision"  # the robot's own, part of the robot file
 # Textures and materials of the robot file may have any other name.
 _FLOOR, _SKY = "safe_rl_floor", "safe_rl_sky"
@@ -193,7 +185,7 @@ def _decorate(spec: mujoco.MjSpec, config: SafetyGymConfig) -> None:
     light.diffuse, light.specular = [0.7] * 3, [0.1] * 3
     headlight = spec.visual.headlight
     headlight.ambient, headlight.diffuse, headlight.specular = [0.35] * 3, [0.25] * 3, [0] * 3
-    for name, position in {**FIXED_CAMERAS, TRACK: FIXED_CAMERAS["fixednear"]}.items():
+    for name, position in FIXED_CAMERAS.items():
         if spec.camera(name) is None:  # those of the robot file are preferred
             spec.worldbody.add_camera(name=name, pos=position, quat=_NORTH_DOWN)
 
@@ -288,7 +280,6 @@ def _index(
 
 
 def _oriented_body(config: SafetyGymConfig, model: mujoco.MjModel, robot: Robot) -> int:
-    """Body id of `reward_orientation_body`."""
     wanted = config.reward_orientation_body
     names = [model.body(i).name for i in range(1, 1 + robot.num_bodies)]
     if wanted not in names:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import FrozenInstanceError, fields
-from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -65,9 +64,6 @@ class SafetyGymConfig(Keys):
         if name in KEYS:
             return KEYS[name].default
         raise AttributeError(f"There is no configuration key '{name}'.{did_you_mean(name, KEYS)}")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return partial(SafetyGymConfig, **self.to_dict()), ()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, SafetyGymConfig) and self.to_dict() == other.to_dict()

@@ -12,24 +12,10 @@ from torch import Tensor
 
 from safe_rl.envs import rng
 from safe_rl.envs.physics import put
+from safe_rl.envs.safety_gym import episodes
 from safe_rl.envs.safety_gym.building import build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
-from safe_rl.envs.safety_gym.episodes import (
-    LAYOUT_KEYS,
-    Purpose,
-    control_noise,
-    draw_layouts,
-    draw_substeps,
-    gremlin_path,
-    make_world,
-    next_goals,
-    place_mocaps,
-    point_goal_at_button,
-    refresh,
-    start_episodes,
-    stored_tensors,
-)
 from safe_rl.envs.safety_gym.layouts import plan_placements
 from safe_rl.envs.safety_gym.observations import Privileged, make_observer, observation_spec
 from safe_rl.envs.safety_gym.renderer import WorldRenderer, vision_block
@@ -90,7 +76,7 @@ class SafetyGymEnv(SimulatedEnv):
     first_camera: ClassVar = "fixedfar"
     # without the last control, sensors that depend on actuators differ until the next step
     optional: ClassVar = (
-        *(*SimulatedEnv.optional, *LAYOUT_KEYS, "fixed_layout", "target_quat"),
+        *(*SimulatedEnv.optional, *episodes.LAYOUT_KEYS, "fixed_layout", "target_quat"),
         *("ctrl", "act", "history", "last_costs", "cost_traces", "since_goal"),
     )
     copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
@@ -111,9 +97,9 @@ class SafetyGymEnv(SimulatedEnv):
         bodies = slice(1, scene.free_bodies.start)
         self._physics = physics = self._make_physics(scene.model, bodies, num_threads)
         self.seconds_per_step = physics.timestep * self.config.frameskip_binom_n
-        self._world = make_world(scene, physics)
+        self._world = episodes.make_world(scene, physics)
         self._plan = plan_placements(scene, physics.device)
-        draw = partial(draw_layouts, self._plan, physics)
+        draw = partial(episodes.draw_layouts, self._plan, physics)
         shape = (num_envs, self._plan.num_columns, 2)
         self._fixed_layout = torch.zeros_like(self._world.step_count)
         self._layouts = rng.DrawnAhead(draw, shape, physics.device)
@@ -147,7 +133,7 @@ class SafetyGymEnv(SimulatedEnv):
         super()._set_seed(seed, rows)
         if seed is not None:  # without `randomize_layout`, all rows have one layout
             layout_seed = torch.tensor(seed, device=self._physics.device)
-            self._fixed_layout[rows] = rng.fold(layout_seed, Purpose.LAYOUT)
+            self._fixed_layout[rows] = rng.fold(layout_seed, episodes.Purpose.LAYOUT)
 
     def _layout_key(self, ahead: int = 0) -> Tensor:
         """Return random keys of the layouts of the `ahead`-th next episodes, [N].
@@ -160,8 +146,9 @@ class SafetyGymEnv(SimulatedEnv):
             key = rng.fold(self._row_seed, self._episode + ahead)
         if config.layout_seeds is None:
             return key
-        index = (rng.uniform(key, Purpose.LAYOUT_SEED) * config.layout_seeds).to(torch.int64)
-        return rng.fold(config.layout_seeds_first + index, Purpose.LAYOUT_SEED)
+        purpose = episodes.Purpose.LAYOUT_SEED
+        index = (rng.uniform(key, purpose) * config.layout_seeds).to(torch.int64)
+        return rng.fold(config.layout_seeds_first + index, purpose)
 
     def _step_key(self) -> Tensor:
         """Return random keys of the step that is being taken, [N]."""
@@ -170,7 +157,7 @@ class SafetyGymEnv(SimulatedEnv):
     def _begin(self, mask: Tensor) -> None:
         key = self._layout_key()
         layouts = self._layouts(key, self._layout_key(ahead=1), mask)
-        start_episodes(self._world, layouts, key, mask)
+        episodes.start_episodes(self._world, layouts, key, mask)
         if self._privileged is not None:
             self._privileged.begin(mask)
         put(self._measured, mask, self._task.measure(self._world))
@@ -210,20 +197,19 @@ class SafetyGymEnv(SimulatedEnv):
         return self._output(flags, torch.cat([reward.unsqueeze(0), costs]))
 
     def _advance(self, action: Tensor) -> Tensor:
-        """Run the substeps of one step; return the worlds whose physics failed, bool [N]."""
         config, physics = self.config, self._physics
         control = action.clamp(*self._control_range)
         counts = None
         if config.action_noise > 0.0:
-            control = control + control_noise(config, self._step_key(), control.shape[-1])
+            control = control + episodes.control_noise(config, self._step_key(), control.shape[-1])
         if config.frameskip_binom_p < 1.0:
-            counts = draw_substeps(config, self._step_key())
+            counts = episodes.draw_substeps(config, self._step_key())
         physics.ctrl.copy_(control)
         path = None
         if self._world.scene.num_targets:
-            path = gremlin_path(self._world, physics.time, config.frameskip_binom_n)
+            path = episodes.gremlin_path(self._world, physics.time, config.frameskip_binom_n)
         failed = physics.step(config.frameskip_binom_n, path, counts=counts)
-        refresh(self._world)
+        episodes.refresh(self._world)
         return failed
 
     def _handle_goals(self, now: Tensor, failed: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -238,7 +224,7 @@ class SafetyGymEnv(SimulatedEnv):
         met = (self._world.require(f"'met' of task '{self.config.task}'", met) > 0) & ~failed
         if not (self.config.continue_goal and self._physics.maybe_any(met)):
             return met, None
-        stuck = next_goals(self._world, self._plan, self._step_key(), met)
+        stuck = episodes.next_goals(self._world, self._plan, self._step_key(), met)
         self._measured.copy_(self._task.measure(self._world))
         return met, stuck
 
@@ -259,7 +245,7 @@ class SafetyGymEnv(SimulatedEnv):
 
     def _read_state(self) -> TensorDict:
         world = self._world
-        state = stored_tensors(world) | self._remembered
+        state = episodes.stored_tensors(world) | self._remembered
         state["goal_pos"] = (
             world.at("goal")[:, 0] if "goal" in world.scene.slots else torch.zeros_like(world.com)
         )
@@ -279,20 +265,20 @@ class SafetyGymEnv(SimulatedEnv):
         target_quat = state.get("target_quat", physics.mocap_quat[:, : scene.num_targets].clone())
         everywhere = torch.ones_like(world.step_count, dtype=torch.bool)
         physics.reset(everywhere)
-        for key, tensor in stored_tensors(world).items():
+        for key, tensor in episodes.stored_tensors(world).items():
             if key in state:
                 tensor.copy_(state[key])
         physics.mocap_quat[:, : scene.num_targets] = target_quat
         world.positions[:, scene.num_free :, :2] = world.layout[:, 1 + scene.num_free :]
         if self._task.goal_at_button:
-            point_goal_at_button(world, everywhere)
+            episodes.point_goal_at_button(world, everywhere)
         elif "goal" in scene.slots:
             goal = scene.slots["goal"].start
             world.positions[:, goal] = state["goal_pos"]
             world.layout[:, 1 + goal] = state["goal_pos"][:, :2]
-        place_mocaps(world)
+        episodes.place_mocaps(world)
         physics.forward()
-        refresh(world)
+        episodes.refresh(world)
         for name, tensor in self._remembered.items():
             tensor.copy_(state.get(name, torch.zeros_like(tensor)))
         self._measured.copy_(self._task.measure(self._world))

@@ -62,7 +62,8 @@ def make_world(scene: Scene, physics: Physics) -> World:
     positions = torch.zeros(3, num_envs, num_objects, **real).movedim(0, -1)
     positions[..., 2] = torch.tensor(scene.heights, **real)
     velocities = physics.qvel[:, scene.robot_nv :].view(num_envs, scene.num_free, 6)[..., :3]
-    robot_pos = physics.xpos[:, robot]
+    outputs = physics.outputs
+    robot_pos, robot_mat = outputs["xpos"][:, robot], outputs["xmat"][:, robot]
     velocity = int(model.sensor("robot_vel").adr[0])
     yaws = torch.full((1 + scene.num_free,), math.nan, dtype=torch.float64)
     if scene.config.robot_rot is not None:
@@ -75,20 +76,20 @@ def make_world(scene: Scene, physics: Physics) -> World:
         scene=scene,
         physics=physics,
         robot_pos=robot_pos,
-        robot_xy=physics.xpos[:, robot, :2],
-        robot_mat=physics.xmat[:, robot],
-        com=physics.subtree_com[:, robot],
-        up=physics.xmat[:, scene.oriented_body, 2, 2],
-        robot_vel=physics.sensordata[:, velocity : velocity + 3],
+        robot_xy=robot_pos[:, :2],
+        robot_mat=robot_mat,
+        com=outputs["subtree_com"][:, robot],
+        up=outputs["xmat"][:, scene.oriented_body, 2, 2],
+        robot_vel=outputs["sensordata"][:, velocity : velocity + 3],
         positions=positions,
         objects={kind: positions[:, span] for kind, span in scene.slots.items()}
         | dict.fromkeys(TASKS[scene.config.task].at_origin, torch.zeros_like(robot_pos[:, None])),
         velocities=velocities,
-        contacts={kind: physics.sensordata[:, cols] for kind, cols in scene.contacts.items()},
+        contacts={kind: outputs["sensordata"][:, cols] for kind, cols in scene.contacts.items()},
         qpos=physics.qpos,
         qvel=physics.qvel,
         ctrl=physics.ctrl,
-        sensordata=physics.sensordata,
+        sensordata=outputs["sensordata"],
         target_travel=torch.tensor(scene.travel, **real),
         # The targets of guided objects are at twice the height of the objects' centres.
         target_height=2 * positions[0, scene.guided, 2],
@@ -105,7 +106,7 @@ def refresh(world: World) -> None:
     """Copy the positions of the free bodies from the physics."""
     scene = world.scene
     if scene.num_free:
-        world.positions[:, : scene.num_free] = world.physics.xpos[:, scene.free_bodies]
+        world.positions[:, : scene.num_free] = world.physics.outputs["xpos"][:, scene.free_bodies]
 
 
 def yaw_quaternion(yaw: Tensor) -> Tensor:
@@ -166,9 +167,8 @@ def draw_layouts(plan: PlacementPlan, physics: Physics, key: Tensor) -> Tensor:
     if "goal" in plan.names:
         # As in the benchmark, the first goal is drawn again after all objects are placed, so it is
         # a second draw. Where no place is found, the first draw remains.
-        position, is_placed = resample_goal(
-            plan, physics, rng.fold(key, Purpose.FIRST_GOAL), layouts
-        )
+        everywhere, key = torch.ones_like(key, dtype=torch.bool), rng.fold(key, Purpose.FIRST_GOAL)
+        position, is_placed = resample_goal(plan, physics, key, layouts, everywhere)
         put(layouts[:, plan.goal_column], is_placed, position)
     return layouts
 

@@ -249,11 +249,7 @@ def _no_layout(plan: PlacementPlan, misfits: Tensor) -> LayoutError:
 
 
 def resample_goal(
-    plan: PlacementPlan,
-    physics: Physics,
-    key: Tensor,
-    layouts: Tensor,
-    wanted: Tensor | None = None,
+    plan: PlacementPlan, physics: Physics, key: Tensor, layouts: Tensor, wanted: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Draw a new goal position that keeps its distance from all other current positions.
 
@@ -262,7 +258,7 @@ def resample_goal(
         physics: The backend, which knows whether the host reads results.
         key: Random keys, int64 [B].
         layouts: Present positions [B, 1 + M, 2].
-        wanted: Rows that get a new goal, bool [B]; None: all.
+        wanted: Rows that get a new goal, bool [B].
 
     Returns:
         The positions [B, 2], and whether one was wanted and found, bool [B]: within 10,000 draws,
@@ -270,8 +266,7 @@ def resample_goal(
     """
     item, (columns, clearance) = plan.goal, plan.beside_goal
     position = layouts.new_zeros(len(key), 2)
-    missing = torch.ones_like(key, dtype=torch.bool) if wanted is None else wanted
-    placed, wanted = layouts.index_select(1, columns), missing
+    missing, placed = wanted, layouts.index_select(1, columns)
     start, block = 0, _GOAL_BLOCK
     most = TRIES_UNSEEN if physics.waits else TRIES_PER_GOAL
     while start < most and physics.maybe_any(missing):

@@ -163,12 +163,6 @@ def _pseudo(
     return read
 
 
-def ray_directions(num_rays: int) -> Tensor:
-    """Return R unit vectors in a robot's xy plane, counter-clockwise from its x axis: [R, 3]."""
-    angle = 2 * math.pi * torch.arange(num_rays, dtype=torch.float64) / num_rays
-    return torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], -1)
-
-
 def _natural(
     scene: Scene, elements: list[Element], device: torch.device
 ) -> Callable[[World], Tensor]:
@@ -178,7 +172,10 @@ def _natural(
     groups beyond MuJoCo's six (the circle's) are never seen; rays pass above hazards;
     `lidar_max_dist`, `lidar_exp_gain` and `lidar_alias` have no effect.
     """
-    rays = ray_directions(scene.config.lidar_num_bins).to(device)
+    num_rays = scene.config.lidar_num_bins
+    angle = 2 * math.pi * torch.arange(num_rays, dtype=torch.float64) / num_rays
+    # in the robot's xy plane, counter-clockwise from its x axis
+    rays = torch.stack([torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)], -1).to(device)
     groups = list(dict.fromkeys(element.group for element in elements))
     column = torch.tensor([groups.index(element.group) for element in elements], device=device)
 

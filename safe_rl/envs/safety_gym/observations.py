@@ -277,13 +277,14 @@ class Privileged:
 
     def __init__(self, world: World, num_costs: int) -> None:
         scene, num_envs = world.scene, len(world.step_count)
-        sizes = {"last_costs": num_costs, "cost_traces": num_costs}
-        for kind, span in scene.slots.items():
-            sizes[f"{kind}_position"] = 3 * (span.stop - span.start)
-        for kind, span in scene.slots.items():
-            if span.stop <= scene.num_free:
-                sizes[f"{kind}_velocity"] = 3 * (span.stop - span.start)
-        sizes |= {"buttons_timer": 1, "since_goal": 1}
+        numbers = {kind: 3 * (span.stop - span.start) for kind, span in scene.slots.items()}
+        free = {kind: n for kind, n in numbers.items() if scene.slots[kind].stop <= scene.num_free}
+        sizes = {
+            **{"last_costs": num_costs, "cost_traces": num_costs},
+            **{f"{kind}_position": number for kind, number in numbers.items()},
+            **{f"{kind}_velocity": number for kind, number in free.items()},
+            **{"buttons_timer": 1, "since_goal": 1},
+        }
         asked = scene.config.observe_privileged
         chosen = tuple(sizes) if isinstance(asked, bool) else asked
         for name in (name for name in chosen if name not in sizes):

@@ -17,13 +17,13 @@ from torch import Tensor
 
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.pictures import Camera, Marker, Pictures, resize
-from safe_rl.envs.safety_gym.building import TRACK, VISION, build_scene
+from safe_rl.envs.safety_gym.building import VISION, build_scene
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.elements import BOX, CYLINDER, ELEMENTS, SPHERE
 from safe_rl.envs.safety_gym.lidar import lidar_blocks
 from safe_rl.envs.safety_gym.world import NO_BUTTON, Block, Scene, World
 
-TRACK_BEHIND, TRACK_ABOVE = 2.0, 2.0  # position of the tracking camera from the robot [m]
+TRACK_DISTANCE = math.hypot(2.0, 2.0)  # the tracking camera is 2 m behind the robot and 2 m above
 
 
 class Display(Pictures):
@@ -60,38 +60,22 @@ class Display(Pictures):
         data.mocap_pos[:] = np.concatenate([mocap_pos, areas])
         data.mocap_quat[: len(mocap_pos)] = _numbers(physics.mocap_quat, row)
         self.place()
-        self._follow()
 
-    def free_camera(self) -> mujoco.MjvCamera:
-        """Return a movable camera in the south from which all placements are visible."""
-        camera = mujoco.MjvCamera()
-        camera.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
-        return camera
+    def free_cameras(self) -> dict[str, mujoco.MjvCamera]:
+        """Return one behind the robot, and one in the south from which all placements are visible.
 
-    def _follow(self) -> None:
-        """Place the tracking camera behind the robot, unless it is one of the robot's file."""
-        model, data = self.scene.model, self.data
-        camera = model.camera(TRACK).id
-        if model.cam_bodyid[camera] != 0:
-            return
-        forward = self._heading()
-        behind = -TRACK_BEHIND * forward + [0.0, 0.0, TRACK_ABOVE]
-        data.cam_xpos[camera] = data.xpos[self.scene.robot_body] + behind
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        backward = behind / np.linalg.norm(behind)
-        axes = np.stack([right, np.cross(backward, right), backward], axis=1)
-        data.cam_xmat[camera] = axes.reshape(-1)
-
-    def _heading(self) -> np.ndarray:
-        """Return the robot's horizontal direction [3]: that of its camera, or its x axis."""
-        model, data = self.scene.model, self.data
-        camera = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, VISION)
+        The robot looks along its camera, or along its x axis if it has none.
+        """
+        free, track = mujoco.MjvCamera(), mujoco.MjvCamera()
+        free.distance = 3 * max(abs(bound) for bound in self._config.placements_extents)
+        data, robot = self.data, self.scene.robot_body
+        camera = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_CAMERA, VISION)
+        ahead = data.xmat[robot].reshape(3, 3)[:, 0]
         if camera >= 0:
-            direction = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
-        else:
-            direction = data.xmat[self.scene.robot_body].reshape(3, 3)[:, 0]
-        angle = math.atan2(direction[1], direction[0])
-        return np.array([math.cos(angle), math.sin(angle), 0.0])
+            ahead = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
+        track.lookat, track.distance = data.xpos[robot], TRACK_DISTANCE
+        track.azimuth = math.degrees(math.atan2(ahead[1], ahead[0]))
+        return {"track": track, "free": free}
 
 
 def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
@@ -206,7 +190,6 @@ class WorldRenderer(Display):
         return frames
 
     def _readings(self) -> dict[str, Tensor]:
-        """Return the present lidar readings of all worlds by kind, [N, num_bins]."""
         readings: dict[str, Tensor] = {}
         for block in self._lidars:
             kinds = [name.removesuffix("_lidar") for name in block.shapes]
@@ -215,7 +198,6 @@ class WorldRenderer(Display):
         return readings
 
     def _markers(self, row: int, readings: dict[str, Tensor], has_cost: bool) -> Iterator[Marker]:
-        """Yield rings, goal button, boundaries, and a sphere if the robot `has_cost`."""
         world = self._world
         robot_pos, robot_mat = _numbers(world.robot_pos, row), _numbers(world.robot_mat, row)
         seen = {kind: _numbers(values, row) for kind, values in readings.items()}

@@ -64,45 +64,31 @@ def limited_speed(velocity: Tensor) -> Tensor:
     return velocity[:, 0] if velocity.shape[-1] == 1 else velocity.square().sum(-1).sqrt()
 
 
-def _inside(value: Tensor, interval: Interval | None) -> Tensor:
-    assert interval is not None
+def _inside(value: Tensor, interval: Interval) -> Tensor:
     low, high = interval
     return (low < value) & (value < high)
 
 
-# Whether a robot is healthy: configuration, positions [N, nq], velocities [N, nv] -> bool [N].
-# Robots that are not in `HEALTH` always are.
-def hopper(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high and upright, all other positions and velocities within bounds."""
-    state = torch.cat([qpos[:, 2:], qvel], -1)
-    return walker2d(config, qpos, qvel) & _inside(state, config.healthy_state_range).all(-1)
+def healthy(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
+    """Return which robots are healthy, bool [N], from positions [N, nq] and velocities [N, nv].
 
-
-def walker2d(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high and upright."""
-    upright = _inside(qpos[:, 2], config.healthy_angle_range)
-    return _inside(qpos[:, 1], config.healthy_z_range) & upright
-
-
-def ant(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Height of the torso within a closed interval, and the state finite."""
-    assert config.healthy_z_range is not None
-    low, high = config.healthy_z_range
-    finite = qpos.isfinite().all(-1) & qvel.isfinite().all(-1)
-    return finite & (low <= qpos[:, 2]) & (qpos[:, 2] <= high)
-
-
-def humanoid(config: VelocityConfig, qpos: Tensor, qvel: Tensor) -> Tensor:
-    """Torso high."""
-    return _inside(qpos[:, 2], config.healthy_z_range)
-
-
-HEALTH: Mapping[str, Callable[[VelocityConfig, Tensor, Tensor], Tensor]] = {
-    "hopper": hopper,
-    "walker2d": walker2d,
-    "ant": ant,
-    "humanoid": humanoid,
-}
+    They are within the ranges that the robot has: of the torso's height and angle, and of all
+    further positions and velocities.
+    """
+    height = qpos[:, RUNNERS[config.robot].num_hidden]
+    is_healthy = torch.ones_like(height, dtype=torch.bool)
+    if config.healthy_z_range is not None:
+        low, high = config.healthy_z_range
+        if config.robot == "ant":  # alone in Gymnasium, its interval is closed, its state finite
+            finite = qpos.isfinite().all(-1) & qvel.isfinite().all(-1)
+            return finite & (low <= height) & (height <= high)
+        is_healthy &= _inside(height, config.healthy_z_range)
+    if config.healthy_angle_range is not None:
+        is_healthy &= _inside(qpos[:, 2], config.healthy_angle_range)
+    if config.healthy_state_range is not None:
+        state = torch.cat([qpos[:, 2:], qvel], -1)
+        is_healthy &= _inside(state, config.healthy_state_range).all(-1)
+    return is_healthy
 
 
 def locomotion_reward(
@@ -196,7 +182,7 @@ class Observer:
     """
 
     def __init__(self, config: VelocityConfig, model: mujoco.MjModel) -> None:
-        self._parts = [*_joints(config, model), *_bodies(config, model)]
+        self._parts = _parts(config, model)
         self.columns = add_columns({}, {part.name: part.size for part in self._parts})
         self.size = sum(part.size for part in self._parts)
 
@@ -217,27 +203,21 @@ class Observer:
         put(observation, mask, start)
 
 
-def _joints(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
-    robot = RUNNERS[config.robot]
+def _parts(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
+    """Components of joints, of all bodies but the world, and forces at joints but the root's."""
+    robot, moving = RUNNERS[config.robot], model.nbody - 1
     first = robot.num_hidden if config.exclude_current_positions_from_observation else 0
     limit = robot.velocity_limit
-    return [
+    low, high = config.contact_force_range or (-torch.inf, torch.inf)
+    parts = [
         Part("qpos", model.nq - first, lambda physics: physics.qpos[:, first:]),
         Part("qvel", model.nv, lambda physics: physics.qvel.clamp(-limit, limit)),
-    ]
-
-
-def _bodies(config: VelocityConfig, model: mujoco.MjModel) -> list[Part]:
-    """Components of all bodies but the world, and actuator forces of all joints but the root."""
-    low, high = config.contact_force_range or (-torch.inf, torch.inf)
-    moving = model.nbody - 1
-    parts = [
         Part("cinert", 10 * moving, lambda p: p.outputs["cinert"][:, 1:].flatten(1)),
         Part("cvel", 6 * moving, lambda p: p.outputs["cvel"][:, 1:].flatten(1)),
         Part("qfrc_actuator", model.nv - 6, lambda p: p.outputs["qfrc_actuator"][:, 6:]),
         Part(FORCES, 6 * moving, lambda p: p.outputs[FORCES][:, 1:].flatten(1).clamp(low, high)),
     ]
-    return [part for part in parts if part.name in observed_parts(config)]
+    return [part for part in parts if part.name in ("qpos", "qvel", *observed_parts(config))]
 
 
 class RobotRenderer(Pictures):
@@ -260,12 +240,12 @@ class RobotRenderer(Pictures):
             frame[:] = self.frame(camera, width, height, [sphere] if has_cost[row] else [])
         return frames
 
-    def free_camera(self) -> mujoco.MjvCamera:
+    def free_cameras(self) -> dict[str, mujoco.MjvCamera]:
         """Return a camera beside the robot that moves with it."""
         free = mujoco.MjvCamera()
         free.type, free.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, TORSO
         free.distance, free.elevation = DISTANCE, ELEVATION
-        return free
+        return {"free": free}
 
     @cached_property
     def model(self) -> mujoco.MjModel:

@@ -185,9 +185,7 @@ class VelocityConfig:
         return cls(**keys)
 
     def replace(self, **changes: Any) -> VelocityConfig:
-        """Return a copy with some keys changed; another `robot` starts from its own defaults."""
-        if changes.get("robot", self.robot) != self.robot:
-            return VelocityConfig.from_dict(changes)
+        """Return a copy with some keys changed."""
         return VelocityConfig.from_dict(self.to_dict() | changes)
 
     def to_dict(self) -> dict[str, Any]:

@@ -16,17 +16,7 @@ from safe_rl.envs import rng
 from safe_rl.envs.physics import RESTORED, BatchPhysics, put
 from safe_rl.envs.physics.runge_kutta import runge_kutta_substep
 from safe_rl.envs.simulated import SimulatedEnv
-from safe_rl.envs.velocity.runner import (
-    FORCES,
-    HEALTH,
-    PLACES,
-    Observer,
-    RobotRenderer,
-    limited_speed,
-    load_model,
-    locomotion_reward,
-    needed_outputs,
-)
+from safe_rl.envs.velocity import runner
 from safe_rl.envs.velocity.velocity_config import RUNNERS, VelocityConfig, resolve_velocity
 
 
@@ -81,14 +71,14 @@ class VelocityEnv(SimulatedEnv):
         super().__init__(num_envs, device, num_threads)
         self.config = resolve_velocity(env)
         self.cost_keys = ["cost", "cost_velocity"]
-        self._model = model = load_model(self.config)
-        outputs = needed_outputs(self.config)
+        self._model = model = runner.load_model(self.config)
+        outputs = runner.needed_outputs(self.config)
         bodies = slice(1, model.nbody)
         self._physics = physics = self._make_physics(model, bodies, num_threads, outputs)
         self.seconds_per_step = physics.timestep * self.config.frame_skip
-        self._observer = Observer(self.config, model)
+        self._observer = runner.Observer(self.config, model)
         shares = torch.from_numpy(model.body_mass / model.body_mass.sum())[:, None]
-        place = PLACES[RUNNERS[self.config.robot].place]
+        place = runner.PLACES[RUNNERS[self.config.robot].place]
         self._place = partial(place.read, physics, shares.to(physics.qpos))
         self._last_place = self._place()
         shape = (num_envs, self._observer.size)
@@ -136,30 +126,25 @@ class VelocityEnv(SimulatedEnv):
         place = self._place()
         velocity = (place - self._last_place) / self.seconds_per_step
         self._last_place.copy_(place)
-        healthy = self._healthy()
-        reward = locomotion_reward(config, velocity[:, 0], control, healthy, physics.outputs)
-        self._has_cost = (limited_speed(velocity) > config.velocity_threshold) & ~failed
-        terminated = failed | ~healthy if config.terminate_when_unhealthy else failed
+        is_healthy = runner.healthy(config, physics.qpos, physics.qvel)
+        reward = runner.locomotion_reward(
+            config, velocity[:, 0], control, is_healthy, physics.outputs
+        )
+        self._has_cost = (runner.limited_speed(velocity) > config.velocity_threshold) & ~failed
+        terminated = failed | ~is_healthy if config.terminate_when_unhealthy else failed
         return reward.masked_fill_(failed, 0.0), terminated
 
     def _advance(self, action: Tensor) -> Tensor:
-        """Run the substeps of one step; returns the robots whose physics failed [N]."""
         physics, num_substeps = self._physics, self.config.frame_skip
         physics.ctrl.copy_(action)
-        if FORCES in physics.outputs and isinstance(physics, BatchPhysics):
+        if runner.FORCES in physics.outputs and isinstance(physics, BatchPhysics):
             failed = physics.step(num_substeps - 1, refresh=False)
             return failed | runge_kutta_substep(physics)
         return physics.step(num_substeps, refresh=False)
 
-    def _healthy(self) -> Tensor:
-        """Return which robots are healthy, bool [N]."""
-        if self.config.robot not in HEALTH:
-            return torch.ones_like(self._begun)
-        return HEALTH[self.config.robot](self.config, self._physics.qpos, self._physics.qvel)
-
     @cached_property
-    def _renderer(self) -> RobotRenderer:
-        return RobotRenderer(self.config, self._physics)
+    def _renderer(self) -> runner.RobotRenderer:
+        return runner.RobotRenderer(self.config, self._physics)
 
     def _read_state(self) -> TensorDict:
         state = {key: getattr(self._physics, key).clone() for key in RESTORED}
