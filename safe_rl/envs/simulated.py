@@ -47,13 +47,10 @@ class SimulatedEnv(ConstrainedEnv):
 
     #: Simulated time of a step [s].
     seconds_per_step: float
-
     #: Whether every world has begun an episode; from then on this stays True.
     _all_begun = False
-
     #: Draws factors on the dynamics for every episode, if the configuration has a range of them.
     _dynamics: DrawnDynamics | None = None
-
     config: Any
     #: Draws the worlds, with `frames` as in `WorldRenderer`; a cached property.
     _renderer: Any

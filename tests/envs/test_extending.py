@@ -107,8 +107,8 @@ FLAT = replace(cube("cones", "cone", Motion.FREE), geoms=lambda c: (Geom(BOX, (0
 ONE_GEOM = replace(cube("cones", "cone", Motion.FREE), geoms=lambda c: Geom(BOX, (0.1,) * 3))
 WRONG = {
     "two per world": (lambda: wrong_cost(lambda c, w: w.robot_xy), r"cost_odd .*\[2\].* \[2, 2\]"),
-    "no number": (lambda: wrong_cost(lambda c, w: w.up * math.nan), "cost_odd must be finite"),
-    "infinite": (lambda: wrong_cost(lambda c, w: w.up / 0), "cost_odd must be finite"),
+    "no number": (lambda: wrong_cost(lambda c, w: w.up * math.nan), "cost_odd must be 0 or more"),
+    "infinite": (lambda: wrong_cost(lambda c, w: w.up / 0), "cost_odd must be 0 or more"),
     "size": (lambda: register_element(FLAT, {"cones_num": 1}), "(?s)size 2 must be.*your elements"),
     "geoms": (lambda: register_element(ONE_GEOM, {"cones_num": 1}), "^'geoms' of 'cones' must ret"),
     "key": (lambda: wrong_cost(lambda c, w: c.goal_sise * w.up), "'goal_sise'.*'goal_size'"),

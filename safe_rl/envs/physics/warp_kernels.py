@@ -69,25 +69,3 @@ def find_failures(live: wp.array2d(dtype=float), largest: float, failed: wp.arra
     world, column = wp.tid()
     if not (wp.abs(live[world, column]) < largest):
         failed[world] = True
-
-
-@wp.kernel
-def note_overflow(
-    num_contacts: wp.array(dtype=int),
-    num_candidates: wp.array(dtype=int),
-    num_rows: wp.array(dtype=int),
-    contacts: int,
-    rows: int,
-    bits: wp.array(dtype=int),
-    contact_bits: int,
-    row_bits: int,
-    overflow: wp.array(dtype=int),
-):
-    """Set `overflow` [2] if contacts (0) or constraint rows (1) found no room in a world."""
-    world = wp.tid()
-    if num_contacts[0] > contacts or num_candidates[0] > contacts:
-        overflow[0] = 1
-    if (bits[world] & contact_bits) != 0:
-        overflow[0] = 1
-    if num_rows[world] > rows or (bits[world] & row_bits) != 0:
-        overflow[1] = 1

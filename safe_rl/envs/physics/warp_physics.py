@@ -93,6 +93,7 @@ class WarpPhysics(Physics):
             )
         self._bind(model)
         self.outputs = {name: wp.to_torch(getattr(self._data, name)) for name in outputs}
+        self._lost = wp.to_torch(self._data.overflow)  # a substep sets bits, and none is unset
         self._warm_up()
 
     def _bind(self, model: mujoco.MjModel) -> None:
@@ -107,7 +108,6 @@ class WarpPhysics(Physics):
         flat = {name: shared[name].view(num_envs, -1) for name in initial}
         self._rows: dict[str, Any] = {name: wp.from_torch(values) for name, values in flat.items()}
         self._start = {name: wp.from_torch(values[0].clone()) for name, values in flat.items()}
-        self._overflow = torch.zeros(2, dtype=torch.int32, device=self.device)
         self._mask = torch.zeros(num_envs, dtype=torch.bool, device=self.device)
         self._failed = self._mask.clone()
 
@@ -116,11 +116,10 @@ class WarpPhysics(Physics):
         self._mask.fill_(True)
         with self._launching():
             self._substeps(1, None)
-            self._forward()
+            mjw.forward(self._model, self._data)
             self._reset(self._mask)
         # all objects were at one place here, so there were too many contacts
-        self._overflow.zero_()
-        wp.to_torch(self._data.overflow).zero_()
+        self._lost.zero_()
 
     def reset(self, mask: Tensor) -> None:
         """Set the simulations in `mask` to the model's initial state, see `Physics`."""
@@ -129,7 +128,7 @@ class WarpPhysics(Physics):
 
     def forward(self, mask: Tensor | None = None) -> None:
         """Compute the outputs of all simulations from the state, see `Physics`."""
-        self._run("forward", self._forward)
+        self._run("forward", mjw.forward, self._model, self._data)
         self._check_rooms()
 
     def step(
@@ -177,11 +176,12 @@ class WarpPhysics(Physics):
 
     def _check_rooms(self) -> None:
         self._look()
-        self.check(self._overflow > 0, self._no_room)
+        self.check((self._lost & (_LOST_CONTACTS | _LOST_ROWS)) != 0, self._no_room)
 
     def _no_room(self) -> BufferOverflowError:
-        names = [name for name, lost in zip(self._rooms, self._overflow, strict=True) if lost]
-        room = " and ".join(f"{self._rooms[name]} {name}" for name in names or self._rooms)
+        bits = {"contacts": _LOST_CONTACTS, "constraints": _LOST_ROWS}
+        names = [name for name in bits if (self._lost & bits[name]).any()]
+        room = " and ".join(f"{self._rooms[name]} {name}" for name in names)
         return BufferOverflowError(
             f"There is room for {room} per environment, but there were more; some were left out. "
             "Raise env.physics_buffers."
@@ -221,7 +221,8 @@ class WarpPhysics(Physics):
                 row = self._rows[name]
                 wp.launch(kernels.find_failures, row.shape, [row, mujoco.mjMAXVAL], failed)
         self._reset(self._failed)
-        self._forward() if refresh else self._note_overflow()
+        if refresh:
+            mjw.forward(self._model, self._data)
 
     def _substeps(self, num_substeps: int, path: Tensor | None) -> None:
         for substep in range(num_substeps):
@@ -229,20 +230,6 @@ class WarpPhysics(Physics):
                 live = self._rows["mocap_pos"]
                 wp.launch(kernels.follow_path, live.shape, [wp.from_torch(path), substep], [live])
             mjw.step(self._silent, self._data)
-
-    def _forward(self) -> None:
-        mjw.forward(self._model, self._data)
-        self._note_overflow()
-
-    def _note_overflow(self) -> None:
-        data = self._data
-        lost = [data.overflow, _LOST_CONTACTS, _LOST_ROWS]
-        wp.launch(
-            kernels.note_overflow,
-            data.nworld,
-            [data.nacon, data.ncollision, data.nefc, data.naconmax, data.njmax, *lost],
-            [wp.from_torch(self._overflow)],
-        )
 
     def _reset(self, mask: Tensor) -> None:
         chosen = wp.from_torch(mask)

@@ -249,6 +249,7 @@ def _index(
     slots = add_columns({}, {kind: len(objects) for kind, objects in names.items()})
     num_free = sum(len(names[element.kind]) for element in present if element.motion in PUSHED)
     spans = [slots[element.kind] for element in guided] or [slice(0, 0)]
+    root = model.body("robot").id
     return Scene(
         config=config,
         model=model,
@@ -265,12 +266,12 @@ def _index(
             for element in guided
             for _ in names[element.kind]
         ),
-        robot_body=model.body("robot").id,
+        robot_body=root,
         robot_sensors=robot.num_sensors,
         robot_nq=model.nq - 7 * num_free,
         robot_nv=model.nv - 6 * num_free,
         planar=robot.planar,
-        oriented_body=_oriented_body(config, model, robot),
+        oriented_body=_oriented_body(config, model, robot) if config.reward_orientation else root,
         free_bodies=slice(1 + robot.num_bodies, 1 + robot.num_bodies + num_free),
         contacts={
             kind: slice(first := int(model.sensor(sensors[0]).adr[0]), first + len(sensors))

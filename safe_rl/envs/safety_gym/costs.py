@@ -138,4 +138,4 @@ def compute_costs(rows: Sequence[Cost], world: World, failed: Tensor) -> Tensor:
 
 def _wrong_costs(rows: Sequence[Cost], wrong: Tensor) -> ConfigError:
     keys = [row.key for row, is_wrong in zip(rows, wrong[1:-1].any(1), strict=True) if is_wrong]
-    return ConfigError(f"{', '.join(keys)} must be finite numbers of 0 or more for every world.")
+    return ConfigError(f"{', '.join(keys)} must be 0 or more and finite in every world.")

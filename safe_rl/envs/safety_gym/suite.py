@@ -144,6 +144,11 @@ def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
         return check(env)
     if isinstance(env, Mapping):
         return check(SafetyGymConfig(**env))
+    if not isinstance(env, str):
+        raise ConfigError(
+            "An environment is given by its name, a mapping of keys, or a SafetyGymConfig; got a "
+            f"{type(env).__name__}."
+        )
     name = env.removeprefix("Safexp-").removesuffix("-v0")
     named = SUITE | EXTRAS
     if name not in named:
@@ -180,9 +185,8 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
     if config.constrain_velocity and config.velocity_limit is None:
         raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
-    if config.physics == "warp" and (
-        config.lidar_type == "natural" or config.frameskip_binom_p < 1.0
-    ):
+    needs_cpu = config.lidar_type == "natural" or config.frameskip_binom_p < 1.0
+    if config.physics == "warp" and needs_cpu:
         raise ConfigError("'lidar_type' natural and 'frameskip_binom_p' < 1 need 'physics' cpu.")
     keys = vars(config)
     for kind in (name.removesuffix("_keepout") for name in keys if name.endswith("_keepout")):
