@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
 
-from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymConfig, env_node, make_env
-from safe_rl.envs.velocity import VELOCITY_SUITE, resolve_velocity
+from safe_rl.envs import EXTRAS, SUITE, ConfigError, env_node, make_env
+from safe_rl.envs.velocity import VELOCITY_SUITE
 
 IDS = [f"Safexp-{name}-v0" for name in (*SUITE, *EXTRAS)]
 SHORT = {"num_steps": 3}
@@ -83,15 +83,12 @@ def test_any_configuration_can_be_made():
     assert "cost_hazards" in env.step(env.action_space.sample())[-1]
     changed = gymnasium.make("Safexp-PointGoal1-v0", config={"lidar_num_bins": 8})
     assert changed.observation_space.shape == (12 + 3 * 8,)
-    hopper = resolve_velocity("SafeHopperVelocity").replace(num_steps=7)
-    assert gymnasium.make("SafeHopperVelocity-v0", config=hopper).spec.max_episode_steps == 7
+    short = gymnasium.make("SafeHopperVelocity-v0", config={"num_steps": 7})
+    assert short.spec.max_episode_steps == 7
     for told, name, given in (
         ("Did you mean 'hazards_num'", "Safexp-Custom", {"config": {"hazard_num": 2}}),
-        (r"is a name: .*make_env\('PointRun'\)", "Safexp-Custom", {"config": "PointRun"}),
         ("mean 'velocity_threshold'", "SafeHopperVelocity", {"config": {"velocity_treshold": 1}}),
-        (r"config=\{'hazards_num': …\}", "Safexp-PointGoal1", {"hazards_num": 3}),
-        (r"'seed': use reset\(seed=…\)", "Safexp-PointGoal1", {"seed": 3}),
-        ("or a VelocityConfig; got a Safety", "SafeAntVelocity", {"config": SafetyGymConfig()}),
+        ("unexpected keyword argument 'hazards_num'", "Safexp-PointGoal1", {"hazards_num": 3}),
         ("render_mode must be one of", "SafeHopperVelocity", {"render_mode": "ansi"}),
     ):
         with pytest.raises((ConfigError, TypeError, ValueError), match=told):
@@ -146,7 +143,7 @@ def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
     """Rows begin and end apart, because met goals end episodes, and have seeds of their own."""
     config = {"continue_goal": False, "goal_size": 0.9, "num_steps": 30}
     config |= {"observation_flatten": flatten, "randomize_layout": flatten}
-    make = {"id": "Safexp-PointGoal0-v0", "config": config, "positions": flatten}
+    make = {"id": "Safexp-PointGoal0-v0", "config": config}
     ours = gymnasium.make_vec(**make, num_envs=3, autoreset_mode=mode)
     theirs = SyncVectorEnv([lambda: gymnasium.make(**make)] * 3, autoreset_mode=mode)
     assert ours.metadata["autoreset_mode"] is mode

@@ -2,23 +2,117 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
 import numpy as np
+import torch
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Dict
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite, TensorSpec
 
-from safe_rl.envs.gymnasium.world_arrays import (
-    RENDER_MODES,
-    Config,
-    Observation,
-    Worlds,
-    choose,
-    final_infos,
-    take,
-    with_masks,
-)
+from safe_rl.envs.families import env_node, make_env
+from safe_rl.envs.keys import COST
+
+EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
+NUM_SEEDS = 2**62
+RENDER_MODES = ["rgb_array"]
+
+Observation = np.ndarray | dict[str, np.ndarray]
+Keys = Mapping[str, Any] | None
+
+
+class Worlds:
+    """A batched environment as arrays: the common part of both interfaces.
+
+    The environment's spec gives the length of episodes, for wrappers and tools that read it. The
+    registered spec does not, because Gymnasium would add a second time limit.
+
+    Attributes:
+        batch: The batched environment inside.
+    """
+
+    batch: Any  # a `SimulatedEnv`
+    _spec: EnvSpec | None = None
+    _is_seeded = False
+
+    def _open(
+        self,
+        name: str | None,
+        config: Keys,
+        *,
+        num_envs: int,
+        num_threads: int,
+        render_mode: str | None = None,
+        camera: Any = None,
+        width: int = 480,
+        height: int = 360,
+    ) -> None:
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
+        node = {**({} if name is None else env_node(name)), **(config or {})}
+        self.batch = make_env(node, num_envs=num_envs, seed=0, num_threads=num_threads)
+        self.render_mode = render_mode
+        self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
+        self._episode_cost = np.zeros(num_envs)  # since the last reset
+        rate = max(1, round(1 / self.batch.seconds_per_step))  # of real time
+        self.metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": rate}
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The registered spec, with the configuration's `num_steps` as `max_episode_steps`."""
+        return self._spec and replace(self._spec, max_episode_steps=self.batch.max_episode_steps)
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+
+    def _spaces(self) -> tuple[gymnasium.Space, Box]:
+        """Spaces of one environment's observation (by name if it is nested) and action."""
+        seen = self.batch.observation_spec["observation"]
+        ends = self.batch.action_spec.space
+        actions = Box(ends.low[0].cpu().numpy(), ends.high[0].cpu().numpy(), dtype=np.float32)
+        if isinstance(seen, Composite):
+            return Dict({name: _any_numbers(part) for name, part in seen.items()}), actions
+        return _any_numbers(seen), actions
+
+    def _seed(self, seed: int | Sequence[int | None] | None, generator: Any) -> None:
+        """Seed all later episodes; without a seed, the first call draws one."""
+        if isinstance(seed, int):
+            self.batch.set_seed(seed % NUM_SEEDS)
+        elif not self._is_seeded:
+            self.batch.set_seed(int(generator.integers(NUM_SEEDS)))
+        if isinstance(seed, Sequence):
+            self.batch.set_row_seeds([None if s is None else int(s) % NUM_SEEDS for s in seed])
+        self._is_seeded = True
+
+    def _reset(self, mask: np.ndarray) -> Observation:
+        """Start episodes in the rows of a mask [N]; return the observation of all rows."""
+        self._episode_cost[mask] = 0.0
+        begins = TensorDict({"_reset": torch.from_numpy(mask).unsqueeze(-1)}, len(mask))
+        # TorchRL's `reset` would return zeros for the other rows
+        return _arrays(self.batch._reset(begins)["observation"])
+
+    def _step(
+        self, actions: np.ndarray
+    ) -> tuple[Observation, tuple[Any, Any, Any], dict[str, Any]]:
+        """Take a step; return observation, (reward, terminated, truncated) [N] each, and infos."""
+        action = torch.as_tensor(actions, dtype=torch.float32, device=self.batch.device)
+        step = self.batch.step(TensorDict({"action": action}, self.batch.batch_size))["next"]
+        names = ("reward", "terminated", "truncated", *self.batch.cost_keys, *self.batch.events)
+        column = {name: step[name].squeeze(-1).cpu().numpy() for name in names}
+        infos = {key: column[key].astype(np.float64) for key in self.batch.cost_keys}
+        infos |= {key: column[key] for key in self.batch.events}
+        self._episode_cost += infos[COST]
+        # at every step, because wrappers such as `TimeLimit` may end the episode after any of them
+        infos[EPISODE_COST] = self._episode_cost.copy()
+        values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
+        return _arrays(step["observation"]), values, infos
 
 
 class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
@@ -26,17 +120,11 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
 
     Args:
         name: Name of the environment; None uses Safety Gym with the default of every key.
-        config: Keys to change, or a whole `SafetyGymConfig` or `VelocityConfig` of its family.
-            `num_steps` is the length of episodes; `max_episode_steps` of `gymnasium.make` can only
-            shorten them.
-        render_mode: "rgb_array" for frames, or None; "human" is for `gymnasium.make`, whose wrapper
-            shows the frames in a window.
-        camera: Camera of the frames, as in the environment's `render`; None is its first.
-        width: Width of a frame [pixels].
-        height: Height of a frame [pixels].
-        sleep: As in `SafetyGymEnv`.
-        positions: Whether every info has `info["positions"]`: float64 [K, 3] by kind (m), as
-            in `SafetyGymEnv.get_positions`.
+        config: Keys to change. `num_steps` is the length of episodes; `max_episode_steps` of
+            `gymnasium.make` can only shorten them.
+        settings: `render_mode`, "rgb_array" for frames, or None ("human" is for `gymnasium.make`,
+            whose wrapper shows the frames in a window); `camera` of the frames, as in the
+            environment's `render`; their `width` and `height` [pixels].
 
     Raises:
         ConfigError: For a configuration that cannot be used.
@@ -53,9 +141,9 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
 
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES}  # noqa: RUF012
 
-    def __init__(self, name: str | None = None, config: Config = None, **settings: Any) -> None:
-        self._open(name, config, 1, 1, None, **settings)
-        self.observation_space, self.action_space = self.spaces()
+    def __init__(self, name: str | None = None, config: Keys = None, **settings: Any) -> None:
+        self._open(name, config, num_envs=1, num_threads=1, **settings)
+        self.observation_space, self.action_space = self._spaces()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -63,8 +151,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         """Start an episode; a seed determines this one and all later ones."""
         super().reset(seed=seed)
         self._seed(seed, self.np_random)
-        observation = take(self._reset(), 0)
-        return observation, self._position()
+        return _take(self._reset(np.ones(1, dtype=bool)), 0), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action [nu]."""
@@ -74,8 +161,8 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         # arrays of NumPy; its booleans are not among these, so an event is an array without axes.
         info = {
             key: value[0] if value.dtype != bool else value[0, ...] for key, value in infos.items()
-        } | self._position()
-        return take(observation, 0), reward, terminated, truncated, info
+        }
+        return _take(observation, 0), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Return a frame, uint8 [height, width, 3], in the mode "rgb_array"."""
@@ -84,9 +171,6 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     def close(self) -> None:
         """Free the memory of OpenGL."""
         self.batch.close()
-
-    def _position(self) -> dict[str, Any]:
-        return {key: take(values, 0) for key, values in self._positions().items()}
 
 
 class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
@@ -104,7 +188,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
             `reset(options={"reset_mask": mask})`.
         num_threads: Threads that step the physics; 0 for one per core.
         max_episode_steps: Replaces `num_steps`; `gymnasium.make_vec` passes it on.
-        settings: Other arguments of `WorldEnv`; positions are [N, K, 3].
+        settings: As in `WorldEnv`.
 
     Raises:
         ConfigError: For a configuration that cannot be used.
@@ -127,17 +211,19 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         self,
         num_envs: int = 1,
         name: str | None = None,
-        config: Config = None,
+        config: Keys = None,
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         num_threads: int = 0,
         max_episode_steps: int | None = None,
         **settings: Any,
     ) -> None:
-        self._open(name, config, num_envs, num_threads, max_episode_steps, **settings)
+        length = {} if max_episode_steps is None else {"num_steps": max_episode_steps}
+        keys = {**(config or {}), **length}
+        self._open(name, keys, num_envs=num_envs, num_threads=num_threads, **settings)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space, self.single_action_space = self.spaces()
+        self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
@@ -151,21 +237,26 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
             seed: An integer that determines the episodes of all environments; or N of them, one per
                 environment, which then has the episodes of `WorldEnv` with that seed. None keeps
                 the present seeds.
-            options: `reset_mask`, bool [N], restricts the reset to some environments.
+            options: `reset_mask`, bool [N], restricts the reset to some environments; their seeds
+                stay what they are.
 
         Raises:
             ValueError: For a mask of another shape or type, for a mask together with a seed, or
                 if the number of seeds is not N.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
-        mask = (options or {}).get("reset_mask")
-        if mask is not None:
-            self._check_mask(mask, seed)
+        mask = np.asarray((options or {}).get("reset_mask", [True] * self.num_envs))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(
+                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
+                f"at least one True, got {mask!r}."
+            )
+        if seed is not None and not mask.all():
+            raise ValueError("A seed is for all environments: give a seed or a 'reset_mask'.")
+        seed = seed.tolist() if isinstance(seed, np.ndarray | np.integer) else seed
+        super().reset(seed=None if isinstance(seed, Sequence) else seed)
         self._seed(seed, self.np_random)
-        observation = self._reset(mask)
-        new = np.ones(self.num_envs, dtype=bool) if mask is None else mask
-        self._ended = self._ended & ~new
-        return observation, with_masks(self._positions(), new)
+        self._ended = self._ended & ~mask
+        return self._reset(mask), {}
 
     def step(
         self, actions: np.ndarray
@@ -180,18 +271,16 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
         # Environments that start an episode in this step.
         begins = terminated | truncated if within else self._ended
-        reported = with_masks(infos, ~begins)
+        reported = _with_masks(infos, ~begins)
         if within:
-            reported |= final_infos(observation, infos | self._positions(), begins)
+            reported |= _final_infos(observation, infos, begins)
         else:
             # the step of an environment that had already ended does not count
             reward = np.where(begins, 0.0, reward)
             terminated, truncated = terminated & ~begins, truncated & ~begins
             self._ended = terminated | truncated
         if begins.any():
-            observation = choose(begins, self._reset(begins), observation)
-        # Where an episode begins, the positions are those of the new episode.
-        reported |= with_masks(self._positions(), np.ones_like(begins))
+            observation = _choose(begins, self._reset(begins), observation)
         return observation, reward, terminated, truncated, reported
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -202,11 +291,45 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         """Free the memory of OpenGL."""
         self.batch.close()
 
-    def _check_mask(self, mask: np.ndarray, seed: Any) -> None:
-        if getattr(mask, "shape", None) != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(
-                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
-                f"at least one True, got {mask!r}."
-            )
-        if seed is not None:
-            raise ValueError("A seed is for all environments: give a seed or a 'reset_mask'.")
+
+def _any_numbers(spec: TensorSpec) -> Box:
+    return Box(-np.inf, np.inf, spec.shape[1:], np.float32)
+
+
+def _arrays(observation: torch.Tensor | TensorDictBase) -> Observation:
+    """Observation of N environments as arrays, by name if it is nested."""
+    if isinstance(observation, TensorDictBase):
+        return {str(key): value.cpu().numpy() for key, value in observation.items()}
+    return observation.cpu().numpy()
+
+
+def _take(observation: Observation, row: int) -> Observation:
+    if isinstance(observation, dict):
+        return {key: value[row] for key, value in observation.items()}
+    return observation[row]
+
+
+def _choose(mask: np.ndarray, chosen: Any, other: Any) -> Any:
+    """Rows of `chosen` where the mask [N] is True, of `other` elsewhere."""
+    if isinstance(other, dict):
+        return {key: _choose(mask, chosen[key], other[key]) for key in other}
+    return np.where(mask.reshape(-1, *[1] * (other.ndim - 1)), chosen, other)
+
+
+def _with_masks(infos: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+    """Set every array [N] to 0 outside the mask [N], and add the mask as `_<key>`."""
+    masked = {key: np.where(mask, values, np.zeros_like(values)) for key, values in infos.items()}
+    return masked | {f"_{key}": mask.copy() for key in infos}
+
+
+def _final_infos(
+    observation: Observation, infos: Mapping[str, Any], ends: np.ndarray
+) -> dict[str, Any]:
+    """Describe the episodes that ended [N], as Gymnasium does in the mode that resets at once."""
+    if not ends.any():
+        return {}
+    final: dict[str, Any] = {"final_obs": np.full(len(ends), None, dtype=object)}
+    for row in np.flatnonzero(ends).tolist():
+        final["final_obs"][row] = _take(observation, row)
+    final["final_info"] = _with_masks(infos, ends)
+    return final | {f"_{key}": ends.copy() for key in final}
