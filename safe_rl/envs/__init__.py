@@ -21,7 +21,7 @@ from safe_rl.extras import import_later
 
 if TYPE_CHECKING:
     from safe_rl.envs.contract import ConstrainedEnv, ContractError, check_constrained_env
-    from safe_rl.envs.gymnasium.conversion import from_gymnasium, from_six_values
+    from safe_rl.envs.gymnasium.conversion import from_gymnasium
     from safe_rl.envs.pictures import OpenGLError
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.safety_gym.layouts import LayoutError
@@ -41,7 +41,6 @@ __all__ = [
     "env_names",
     "env_node",
     "from_gymnasium",
-    "from_six_values",
     "make_env",
     "resolve",
     "store_config",
@@ -52,7 +51,7 @@ __getattr__, __dir__ = import_later(
     __name__,
     {
         "contract": ["ConstrainedEnv", "ContractError", "check_constrained_env"],
-        "gymnasium.conversion": ["from_gymnasium", "from_six_values"],
+        "gymnasium.conversion": ["from_gymnasium"],
         "pictures": ["OpenGLError"],
         "safety_gym.env": ["SafetyGymEnv"],
         "safety_gym.layouts": ["LayoutError"],

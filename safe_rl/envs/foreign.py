@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pkgutil import resolve_name
 from shlex import quote
 from typing import Annotated, Any, NamedTuple
@@ -25,7 +24,6 @@ _RANGES = (
     "another entry [entry, column, lowest, highest]"
 )
 _PRIVILEGED = Key(None, Text | None, "entry that becomes `privileged`, for critics only")
-_MODE = Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it")
 _COMMON = {
     "cost_keys": Key(
         None, tuple[Text, ...] | None, "names of the costs; null: `cost` and all `cost_<kind>`"
@@ -37,8 +35,16 @@ _COMMON = {
 }
 
 
-@dataclass(frozen=True)
-class ForeignFamily:
+_GYMNASIUM = {
+    **_COMMON,
+    "privileged": _PRIVILEGED,
+    "render_mode": Key(None, Text | None, "rgb_array for pictures; evaluate video=true sets it"),
+    "outside": Key(None, Any, _RANGES),
+    "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
+}
+
+
+class ForeignFamily(NamedTuple):
     """The environments of one library; `env=<name> env.id=…` chooses one.
 
     Attributes:
@@ -57,18 +63,12 @@ class ForeignFamily:
 FOREIGN = {
     "gymnasium": ForeignFamily(
         "safe_rl.envs.gymnasium.make_gymnasium",
-        {
-            **_COMMON,
-            "privileged": _PRIVILEGED,
-            "render_mode": _MODE,
-            "outside": Key(None, Any, _RANGES),
-            "flatten": Key(False, bool, "true: one vector; false: dictionaries and pictures stay"),
-        },
+        _GYMNASIUM,
         "safe_rl.envs.gymnasium.conversion:describe_gymnasium",
     ),
     "safety_gymnasium": ForeignFamily(
         "safe_rl.envs.gymnasium.make_safety_gymnasium",
-        {**_COMMON, "render_mode": _MODE},
+        _GYMNASIUM | {"flatten": _GYMNASIUM["flatten"]._replace(default=True)},
         "safe_rl.envs.gymnasium.conversion:describe_safety_gymnasium",
     ),
     "torchrl": ForeignFamily(

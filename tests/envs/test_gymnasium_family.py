@@ -83,22 +83,18 @@ def test_observations_may_be_nested():
     check_env_specs(env)
 
 
-def test_pictures_are_fitted_in():
+def test_pictures_are_the_environments_own():
     node = complete_env(NODE)
     with pytest.raises(ValueError, match="render_mode=rgb_array"):
         make_env(node, seed=0).render(rows=0)
     env = make_env({**node, "render_mode": "rgb_array"}, num_envs=2, seed=0)
     place = env.reset()["observation"][1, 0].item()
-    picture = env.render(rows=1, width=120, height=90)
-    assert picture.shape == (90, 120, 3)
-    columns = picture[:40].max(axis=(0, 2)).nonzero()[0]
-    assert columns.tolist() == [2 * int(30 + 9 * place), 2 * int(30 + 9 * place) + 1]
-    assert not picture[40:].any()
-    assert env.render(width=60, height=20).shape == (2, 20, 60, 3)
-    assert env.render(rows=torch.tensor(1), width=60, height=20).shape == (20, 60, 3)
-    assert env.render(rows=torch.tensor([1]), width=60, height=20).shape == (1, 20, 60, 3)
-    with pytest.raises(ValueError, match="no camera 'track'"):
-        env.render(camera="track")
+    picture = env.render(rows=1)
+    assert picture.shape == (20, 60, 3)
+    assert picture.max(axis=(0, 2)).nonzero()[0].tolist() == [int(30 + 9 * place)]
+    assert env.render().shape == (2, 20, 60, 3)
+    assert env.render(rows=torch.tensor(1)).shape == (20, 60, 3)
+    assert env.render(rows=torch.tensor([1])).shape == (1, 20, 60, 3)
 
 
 def test_registered_arguments_and_limits_are_kept():

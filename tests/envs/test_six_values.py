@@ -4,12 +4,11 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import gymnasium
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import ConfigError, from_gymnasium, from_six_values, make_env
+from safe_rl.envs import ConfigError, from_gymnasium, make_env
 
 NODE = {
     "_target_": "safe_rl.envs.gymnasium.make_safety_gymnasium",
@@ -67,16 +66,28 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**NODE, **keys})
 
 
-def test_a_missing_package_and_another_number_of_values_are_said(monkeypatch, package):
+def test_a_task_ends_its_episodes_after_the_steps_that_are_asked_for():
+    node = {**NODE, "id": "SafetyBuilt-v0", "kwargs": None}
+    for keys, steps in (({}, 12), ({"num_steps": 20}, 20), ({"num_steps": 5}, 5)):
+        env = make_env({**node, **keys}, num_envs=2, seed=0)
+        assert env.max_episode_steps == steps
+        assert rollout(env)["next", "truncated"][0, :, 0].nonzero()[0].item() == steps - 1
+
+
+def test_a_step_whose_physics_failed_costs_what_it_returns():
+    env = make_env({**NODE, "id": "SafetyBuilt-v0", "kwargs": None}, num_envs=2, seed=0)
+    step = rollout(env)["next"]
+    assert step["cost"][:, 2].tolist() == [[1.0], [1.0]]
+    assert not step["cost_fast"][:, 2].any()
+
+
+def test_a_function_may_return_six_values_and_a_missing_package_is_said(monkeypatch, package):
     ice = partial(package.make, "SafetyIce1-v0")
-    for keys in ({}, {"cost_keys": ["cost"]}):
-        with pytest.raises(ValueError, match=r"returned 6 values.*use from_six_values"):
-            from_gymnasium(ice, num_steps=5, **keys).rollout(2)
+    env = from_gymnasium(ice, num_envs=5, num_steps=12, seed=0)
+    assert env.cost_keys == ["cost", "cost_right", "cost_fast"]
+    step = rollout(env)["next"]
+    torch.testing.assert_close(step["cost"], step["cost_right"] + step["cost_fast"])
     monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
-    with pytest.raises(ConfigError, match=r"cannot be imported.*from_six_values"):
+    with pytest.raises(ConfigError, match=r"cannot be imported.*from_gymnasium"):
         make_env(NODE)
-    with pytest.raises(ValueError, match=r"returned 5 values.*env=gymnasium"):
-        from_six_values(lambda: gymnasium.make("Pendulum-v1"))
-    with pytest.raises(ConfigError, match="a function that makes one environment"):
-        from_six_values(gymnasium.make_vec("Pendulum-v1", num_envs=2), num_steps=5)
     monkeypatch.undo()

@@ -1,8 +1,10 @@
 """Stands in for the package: environments whose step returns six values.
 
 What is imitated is its release 1.0 on Gymnasium 0.28: `make`, the limit of time, kinds of costs and
-their sum in `info`.
+their sum in `info`; and its `Builder`, whose task ends episodes itself after `num_steps` steps.
 """
+
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -40,6 +42,25 @@ class Ice(gymnasium.Env):
         return picture
 
 
+class Builder(Ice):
+    """Never far out; its exceptions cost 1 and have no other kind in `info`."""
+
+    def __init__(self, **kwargs):
+        super().__init__(border=np.inf, **kwargs)
+        self.task = SimpleNamespace(num_steps=12)
+
+    def reset(self, **kwargs):
+        self.steps = 0
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        seen, reward, cost, terminated, _, info = super().step(action)
+        self.steps += 1
+        if self.steps == 3:
+            cost, info = 1.0, {"cost_exception": 1.0}
+        return seen, reward, cost, terminated, self.steps >= self.task.num_steps, info
+
+
 class Limited(gymnasium.Wrapper):
     """The package's own limit of time, for six values."""
 
@@ -56,11 +77,13 @@ class Limited(gymnasium.Wrapper):
         return self.env.reset(**kwargs)
 
     def step(self, action):
-        *values, _, info = self.env.step(action)
+        *values, truncated, info = self.env.step(action)
         self.taken += 1
-        return (*values, self.taken >= self.steps, info)
+        return (*values, truncated or self.taken >= self.steps, info)
 
 
 def make(id, max_episode_steps=None, **kwargs):
-    assert id == "SafetyIce1-v0", f"Environment {id} is not registered in safety-gymnasium."
-    return Limited(Ice(**kwargs), max_episode_steps or 12)
+    worlds = {"SafetyIce1-v0": (Ice, 12), "SafetyBuilt-v0": (Builder, 10**9)}
+    assert id in worlds, f"Environment {id} is not registered in safety-gymnasium."
+    world, steps = worlds[id]
+    return Limited(world(**kwargs), max_episode_steps or steps)

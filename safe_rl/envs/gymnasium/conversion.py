@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -14,23 +13,19 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from safe_rl.envs.foreign import FOREIGN, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import (
-    CostIntoInfo,
-    CostReader,
-    GymnasiumEnv,
-    make_adapted,
-)
-from safe_rl.envs.keys import COST, ConfigError, Count, checked, is_cost
+from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, make_adapted
+from safe_rl.envs.keys import ConfigError, Count, checked, is_cost
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
 
 MakeEnv = Callable[[], gymnasium.Env]
+_Maker = Callable[[Mapping[str, Any]], MakeEnv]
 _FAILURES = (AssertionError, NotImplementedError, TypeError, ValueError, gymnasium.error.Error)
 
 
 def from_gymnasium(
-    env: str | MakeEnv,
+    env: str | Callable[..., gymnasium.Env],
     *,
     num_envs: int = 1,
     cost_keys: Sequence[str] | None = None,
@@ -42,7 +37,10 @@ def from_gymnasium(
     privileged: str | None = None,
     **kwargs: Any,
 ) -> GymnasiumEnv:
-    """Make a TorchRL environment of any Gymnasium environment that reports costs in `info`.
+    """Make a TorchRL environment of any Gymnasium environment that reports costs.
+
+    Costs are entries of `info`, or the third of six values of a step, as in Safety-Gymnasium; this
+    one is called `cost`.
 
     Every observation becomes one float32 vector. Continuous actions are clipped to [-1, 1] and
     scaled to the environment's bounds. Choices (Discrete, MultiDiscrete) are integers. The N
@@ -63,7 +61,7 @@ def from_gymnasium(
             dictionaries.
         privileged: Entry of a dictionary that becomes `privileged` [N, m], which critics may read
             and actors never do.
-        kwargs: Arguments of `gymnasium.make`, if `env` is an id.
+        kwargs: Arguments of `gymnasium.make`, or of the function.
 
     Returns:
         An environment [N] with the costs in its reward spec. Without a cost named `cost`, the sum
@@ -80,10 +78,20 @@ def from_gymnasium(
         torch.Size([2, 3, 1])
     """
     checked("num_envs", Count, num_envs)
-    make = _maker(env, kwargs, num_steps)
-    keys, length = _describe(make, cost_keys, num_steps, outside)
-    config = {"cost_keys": keys, "num_steps": length, "outside": outside}
+    if num_steps is not None:
+        checked("num_steps", Count, num_steps)
+    if isinstance(cost_keys, str):
+        raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
+    if isinstance(env, str):
+        length = {} if num_steps is None else {"max_episode_steps": num_steps}
+        # the spec, because other processes may not have registered the id
+        spec = gymnasium.registry.get(env, env)
+        make: MakeEnv = partial(gymnasium.make, spec, **{**length, **kwargs})
+    else:
+        make = partial(env, **kwargs)
+    config = {"cost_keys": cost_keys, "num_steps": num_steps, "outside": outside}
     config |= {"flatten": flatten, "privileged": privileged}
+    config["cost_keys"], config["num_steps"] = _describe(make, config)
     return _batch(make, config, num_envs, seed, device, watch=cost_keys is None)
 
 
@@ -97,18 +105,17 @@ def _batch(
     watch: bool = True,
 ) -> GymnasiumEnv:
     """Make N environments; with `watch`, there is a warning about costs that are not counted."""
-    whole = {"outside": None, "cost": None, "privileged": None, "flatten": True, **config}
-    keys = whole["cost_keys"] = [*dict.fromkeys(config["cost_keys"])]
+    keys, length = [*dict.fromkeys(config["cost_keys"])], config["num_steps"]
     # a dictionary keeps its entries until the privileged one is taken out
-    is_vector = whole["flatten"] and whole["privileged"] is None
-    make_one = partial(make_adapted, make, whole["num_steps"], is_vector, keys, watch)
+    is_vector = config["flatten"] and config["privileged"] is None
+    make_one = partial(make_adapted, make, length, is_vector, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
     worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = _PartlyReset(worlds, device=torch.device(device), categorical_action_encoding=True)
     entries = list(map(dotted, base.observation_spec.keys(True, True)))
-    whole["observe"] = [name for name in entries if name != whole["privileged"]]
-    base.set_info_dict_reader(CostReader(keys, num_envs, patience=whole["num_steps"]))
-    batch = GymnasiumEnv(base, whole)
+    observe = [name for name in entries if name != config["privileged"]]
+    base.set_info_dict_reader(CostReader(keys, num_envs, patience=length))
+    batch = GymnasiumEnv(base, {**config, "cost_keys": keys, "observe": observe, "cost": None})
     batch.set_seed(int(torch.randint(2**31, ())) if seed is None else seed)
     return batch
 
@@ -118,43 +125,6 @@ class _PartlyReset(GymWrapper):
 
     def _replace_reset(self, reset: Tensor | None, kwargs: dict[str, Any]) -> dict[str, Any]:
         return kwargs if reset is None else super()._replace_reset(reset.cpu(), kwargs)
-
-
-def from_six_values(
-    env: MakeEnv, *, cost_keys: Sequence[str] | None = None, **settings: Any
-) -> GymnasiumEnv:
-    """Make a TorchRL environment of environments whose step returns six values.
-
-    Args:
-        env: A function that makes one environment with the interface of Safety-Gymnasium.
-        cost_keys: Names of costs in `info` that are used beside the cost that a step returns; None
-            takes one step, and uses the names `cost_<kind>` that it reports.
-        settings: Other arguments of `from_gymnasium`.
-
-    Returns:
-        An environment [N]; `cost` is the cost that a step returns.
-
-    Raises:
-        ValueError: If a step has another number of values, or the length of episodes is not known.
-
-    Examples:
-        >>> import numpy as np
-        >>> class Slide(gymnasium.Env):
-        ...     observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-        ...     action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-        ...     def reset(self, seed=None, options=None):
-        ...         return np.zeros(1, np.float32), {}
-        ...     def step(self, action):
-        ...         return action, 1.0, float(action[0] > 0), False, False, {}
-        >>> from_six_values(Slide, num_envs=2, num_steps=5).rollout(9)["next", "cost"].shape
-        torch.Size([2, 5, 1])
-    """
-    if not callable(env):
-        raise ConfigError(
-            f"Give a function that makes one environment; num_envs=… makes several. Got {env!r}."
-        )
-    keys = None if cost_keys is None else [COST, *(key for key in cost_keys if key != COST)]
-    return from_gymnasium(lambda: CostIntoInfo(env()), cost_keys=keys, **settings)
 
 
 def make_gymnasium(config: Mapping[str, Any], **settings: Any) -> GymnasiumEnv:
@@ -182,7 +152,7 @@ def make_safety_gymnasium(config: Mapping[str, Any], **settings: Any) -> Gymnasi
 
 def _make_node(
     family: str,
-    maker: Callable[[Mapping[str, Any]], MakeEnv],
+    maker: _Maker,
     config: Mapping[str, Any],
     num_envs: int,
     device: torch.device | str = "cpu",
@@ -197,30 +167,23 @@ def _make_node(
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
-def _describe_node(
-    maker: Callable[[Mapping[str, Any]], MakeEnv], config: Mapping[str, Any]
-) -> tuple[list[str], int]:
+def _describe_node(maker: _Maker, config: Mapping[str, Any]) -> tuple[list[str], int]:
     """Return the cost keys and the length of episodes of a node; None is replaced by a value."""
-    make, outside = maker(config), config.get("outside")
+    make = maker(config)
     try:
-        return _describe(make, config["cost_keys"], config["num_steps"], outside)
+        return _describe(make, config)
     except _FAILURES as error:
         raise ConfigError(f"env.id={config['id']}: {error}") from error
 
 
-def _describe(
-    make: MakeEnv, cost_keys: Sequence[str] | None, num_steps: int | None, outside: Any
-) -> tuple[list[str], int]:
-    if num_steps is not None:
-        checked("num_steps", Count, num_steps)
-    if isinstance(cost_keys, str):
-        raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
-    if cost_keys is not None and num_steps is not None:  # environments may be slow to make
-        return list(cost_keys), num_steps
+def _describe(make: MakeEnv, config: Mapping[str, Any]) -> tuple[list[str], int]:
+    keys, length = config["cost_keys"], config["num_steps"]
+    if keys is not None and length is not None:  # environments may be slow to make
+        return list(keys), length
     probe = make()
     try:
-        keys = _find_costs(probe) if cost_keys is None else list(cost_keys)
-        if cost_keys is None and not keys and not outside:
+        keys = _find_costs(probe) if keys is None else list(keys)
+        if not keys and config["cost_keys"] is None and not config["outside"]:
             raise ValueError(
                 f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "
                 "info. If a cost has another name, or is not reported at every step, name it in "
@@ -228,8 +191,9 @@ def _describe(
                 "env.outside='{cost_position: [0, -0.5, 0.5]}'. An algorithm without constraints "
                 "needs no costs: with env.cost_keys=[cost] algo=ppo, a missing cost counts as 0."
             )
-        known = None if probe.spec is None else probe.spec.max_episode_steps
-        length = known if num_steps is None else num_steps
+        task, spec = _task_of(probe), probe.spec
+        limits = getattr(task, "num_steps", None), spec and spec.max_episode_steps
+        length = length or min(filter(None, limits), default=None)
         if length is None:
             raise ValueError(f"{probe} does not say how long episodes are: give 'num_steps'.")
         return keys, length
@@ -237,28 +201,8 @@ def _describe(
         probe.close()
 
 
-def _maker(env: Any, kwargs: Mapping[str, Any], num_steps: int | None) -> MakeEnv:
-    if isinstance(env, str):
-        length = {} if num_steps is None else {"max_episode_steps": num_steps}
-        # the spec, because other processes may not have registered the id
-        return partial(gymnasium.make, gymnasium.registry.get(env, env), **{**length, **kwargs})
-    if isinstance(env, gymnasium.Env) or not callable(env):
-        raise ConfigError(f"Give an id, or a function that makes an environment; got {env!r}.")
-    for key in kwargs:
-        hint = did_you_mean(key, signature(from_gymnasium).parameters)
-        raise ConfigError(f"'{key}' is for gymnasium.make, which a function does not use.{hint}")
-    return partial(_checked, env)
-
-
-def _checked(make: MakeEnv) -> gymnasium.Env:
-    env = make()
-    if not isinstance(env, gymnasium.Env):
-        raise ConfigError(f"The function must return a gymnasium.Env, but it returned {env!r}.")
-    return env
-
-
 def _find_costs(probe: gymnasium.Env) -> list[str]:
-    adapted = make_adapted(lambda: probe, 1, False, [])  # it checks the number of values
+    adapted = make_adapted(lambda: probe, 1, True, [])  # it checks the number of values
     adapted.action_space.seed(0)
     adapted.reset(seed=0)
     *_, info = adapted.step(adapted.action_space.sample())
@@ -293,10 +237,23 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
             f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 needs "
             "older releases of Gymnasium and MuJoCo than safe_rl; install a release that can be "
             "imported beside safe_rl. Your own environments with six values do not need the "
-            "package: use from_six_values."
+            "package: use from_gymnasium."
         ) from error
-    make = partial(safety_gymnasium.make, config["id"], **_arguments(config))
-    return lambda: CostIntoInfo(make())
+
+    def make() -> gymnasium.Env:
+        env = safety_gymnasium.make(config["id"], **_arguments(config))
+        if config["num_steps"] and (task := _task_of(env)):
+            task.num_steps = config["num_steps"]
+        return env
+
+    return make
+
+
+def _task_of(env: gymnasium.Env) -> Any:
+    """The task of Safety-Gymnasium, which ends episodes itself; None for other environments."""
+    world = env.unwrapped
+    is_theirs = type(world).__module__.partition(".")[0] == "safety_gymnasium"
+    return getattr(world, "task", None) if is_theirs else None
 
 
 describe_gymnasium = partial(_describe_node, _registered)
