@@ -17,7 +17,6 @@ from torchrl.data import Bounded, Categorical, Composite, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 
 from safe_rl.envs.keys import COST
-from safe_rl.naming import key_name
 
 
 class ConstrainedEnv(EnvBase):
@@ -170,18 +169,8 @@ class ConstrainedEnv(EnvBase):
         return has_ended
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        try:
-            checked = super()._step_proc_data(next_tensordict_out)
-            return checked.clone() if self.reuses_tensors else checked
-        except (AttributeError, RuntimeError) as error:
-            written = {key: next_tensordict_out.get(key, None) for key in self.reward_keys}
-            shapes = {key: None if v is None else list(v.shape) for key, v in written.items()}
-            if all(shape == [*self.batch_size, 1] for shape in shapes.values()):
-                raise  # for another reason
-            raise ContractError(
-                f"{type(self).__name__}._step must write {[*self.batch_size, 1]} numbers for each "
-                f"of {', '.join(map(key_name, shapes))}. It wrote the shapes {shapes}."
-            ) from error
+        after = super()._step_proc_data(next_tensordict_out)
+        return after.clone() if self.reuses_tensors else after
 
     def continue_from(self, steps: int) -> None:
         """Continue schedules after this number of steps per row in earlier parts of the run."""
@@ -208,13 +197,6 @@ def add_columns(layout: Mapping[str, slice], sizes: Mapping[str, int]) -> dict[s
     return extended
 
 
-_DEFAULTS = (
-    *("return_key", "seconds_per_step", "steps_per_decision", "steps_before", "first_steps"),
-    *("render", "get_state", "add_steps", "get_positions", "continue_from", "highest_cost"),
-    *("action_bounds", "sensor_keys"),
-)
-
-
 class ContractError(ValueError):
     """An environment does not fulfil the contract; the message lists what is missing."""
 
@@ -232,71 +214,61 @@ def check_constrained_env(env: Any) -> None:
         >>> check_constrained_env(PendulumEnv())  # doctest: +ELLIPSIS
         Traceback (most recent call last):
         ...
-        safe_rl.envs.contract.ContractError: PendulumEnv is no constrained environment:
-        - its batch size must be [N], got []; ...
+        safe_rl.envs.contract.ContractError: PendulumEnv is not derived from ...
     """
-    if not isinstance(env, EnvBase):
+    if not isinstance(env, ConstrainedEnv):
         raise ContractError(
-            f"{type(env).__name__} is not a TorchRL environment (EnvBase). To wrap a Gymnasium "
-            "environment, use `safe_rl.envs.from_gymnasium`."
+            f"{type(env).__name__} is not derived from safe_rl.envs.ConstrainedEnv. For an "
+            "environment of Gymnasium use safe_rl.envs.from_gymnasium, for one of TorchRL "
+            "env=torchrl."
         )
-    problems = [*_shape_problems(env), *_cost_problems(env), *_layout_problems(env)]
-    missing = [name for name in _DEFAULTS if not hasattr(env, name)]
-    if missing:
-        problems.append(
-            f"it has no {', '.join(missing)}: derive it from safe_rl.envs.ConstrainedEnv, which "
-            "has defaults."
-        )
-    if problems:
+    if problems := [*_problems_of_specs(env), *_problems_of_attributes(env)]:
         lines = "".join(f"\n- {problem}" for problem in problems)
         raise ContractError(f"{type(env).__name__} is no constrained environment:{lines}")
 
 
-def _shape_problems(env: EnvBase) -> Iterator[str]:
+def _problems_of_specs(env: ConstrainedEnv) -> Iterator[str]:
     if len(env.batch_size) != 1:
         yield (
             f"its batch size must be [N], got {list(env.batch_size)}; "
             "torchrl.envs.SerialEnv makes a batch of single environments."
         )
-    if "observation" not in env.observation_spec.keys():  # noqa: SIM118, a spec is no mapping
+    seen = env.observation_spec.get("observation", None)
+    if seen is None:
         yield f"it must observe 'observation', got {sorted(map(str, env.observation_spec.keys()))}."
+    parts = seen.values(True, True) if isinstance(seen, Composite) else [seen]
+    for part in parts if seen is not None else ():
+        if len(part.shape) == 2 and part.dtype != torch.float32:
+            yield f"'observation' must be of float32, which networks take, got {part.dtype}."
     if not isinstance(env.action_spec, Bounded | Categorical | OneHot):
         kind = type(env.action_spec).__name__
         yield f"its actions must be continuous and bounded, or choices, got {kind}."
-    for key, part in env.observation_spec.items(True, True):
-        name = key_name(key)
-        is_seen = name.partition("/")[0] == "observation"
-        if is_seen and len(part.shape) == 2 and part.dtype != torch.float32:
-            yield f"'{name}' must be of float32, which networks take, got {part.dtype}."
-    ends = [str(key) for key in env.full_done_spec.keys(True, True)]
-    for key in ("done", "terminated", "truncated"):
-        if key not in ends:
-            yield f"its done spec must have '{key}', got {sorted(ends)}."
-    steps = getattr(env, "max_episode_steps", None)
+    ends = {str(key) for key in env.full_done_spec.keys(True, True)}
+    for key in sorted({"done", "terminated", "truncated"} - ends):
+        yield f"its done spec must have '{key}', got {sorted(ends)}."
+
+
+def _problems_of_attributes(env: ConstrainedEnv) -> Iterator[str]:
+    steps, keys, layout = (
+        getattr(env, name, None)
+        for name in ("max_episode_steps", "cost_keys", "observation_layout")
+    )
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
         yield f"'max_episode_steps' must be the largest number of steps of an episode, got {steps}."
-    env_class, base = type(env), ConstrainedEnv
-    stores = isinstance(env, base) and env_class.get_state is not base.get_state
-    if stores and env_class.set_state in (None, base.set_state):
+    stores, restores = (
+        getattr(type(env), name) is not getattr(ConstrainedEnv, name)
+        for name in ("get_state", "set_state")
+    )
+    if stores and not restores:
         yield "it has 'get_state', so it needs 'set_state' too."
-
-
-def _cost_problems(env: EnvBase) -> Iterator[str]:
-    keys = getattr(env, "cost_keys", None)
     if not isinstance(keys, list | tuple) or COST not in keys:
         yield f"'cost_keys' must be a list of names with '{COST}' among them, got {keys}."
-        return
+        keys = ()
     spec, wanted = env.full_reward_spec, (*env.batch_size, 1)
-    written = {str(key): spec[key] for key in spec.keys(True, True)}
+    shapes = {str(key): tuple(spec[key].shape) for key in spec.keys(True, True)}
     for key in ("reward", *keys):
-        if key not in written:
-            yield f"its reward spec must have '{key}', got {sorted(written)}."
-        elif tuple(written[key].shape) != wanted:
-            yield f"'{key}' must have the shape {wanted}, got {tuple(written[key].shape)}."
-
-
-def _layout_problems(env: EnvBase) -> Iterator[str]:
-    layout = getattr(env, "observation_layout", None)
+        if shapes.get(key) != wanted:
+            yield f"its reward spec must have '{key}' of the shape {wanted}, got {shapes}."
     if not isinstance(layout, Mapping) or not all(isinstance(s, slice) for s in layout.values()):
         yield (
             "'observation_layout' must map names to columns of 'observation', such as "
@@ -304,7 +276,7 @@ def _layout_problems(env: EnvBase) -> Iterator[str]:
         )
         return
     seen = env.observation_spec.get("observation", None)
-    width = 0 if seen is None or isinstance(seen, Composite) else seen.shape[-1]
+    width = math.inf if seen is None or len(seen.shape) != 2 else seen.shape[-1]
     for name, columns in layout.items():
-        if width and len(seen.shape) == 2 and (columns.stop or 0) > width:
+        if (columns.stop or 0) > width:
             yield f"'observation_layout' has {columns} for '{name}', beyond the {width} columns."

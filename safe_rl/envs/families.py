@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Container, Mapping
-from inspect import signature
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -202,20 +201,10 @@ def make_env(
     count = checked("num_envs", Count, num_envs)
     given = {"num_envs": count, "device": device, "seed": seed, "num_threads": num_threads}
     node = dict(env if isinstance(env, Mapping) else env_node(env))
-    for key in keys.keys() - node.keys():
-        if meant := did_you_mean(key, [*given, "transforms"], 0.85):
-            raise ConfigError(f"There is no argument '{key}'.{meant}")
     node |= keys
     target = node.pop("_target_", None)
     node.pop("name", None)
     build: Any = SafetyGymEnv if target is None else locate(target, key="env._target_")
-    try:
-        signature(build).bind(node, **given)
-    except TypeError as error:
-        raise ContractError(
-            f"{target}: {error}. It is called with the keys of env as the first argument, and with "
-            f"{', '.join(given)} by name."
-        ) from None
     batch = build(node, **given)
     if transforms:
         batch = transform_env(batch, transforms, evaluating=evaluating, seed=seed)

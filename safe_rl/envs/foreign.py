@@ -97,16 +97,11 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
     """
     for key in node:
         if key not in (*family.keys, "id", "name", "_target_"):
-            if key in ("physics", "physics_buffers"):
-                hint = (
-                    f" Only Safety Gym's environments and the velocity family have '{key}': the "
-                    "physics of all others runs on the CPU only. Remove it, and preset=gpu, which "
-                    "sets 'physics'."
-                )
-            else:
-                hint = did_you_mean(str(key), [*family.keys, "id"])
-                hint += " The environment's own arguments belong in 'kwargs': env.kwargs='{…}'."
-            raise ConfigError(f"This environment has no key '{key}'.{hint}")
+            hint = did_you_mean(str(key), [*family.keys, "id"])
+            raise ConfigError(
+                f"This environment has no key '{key}'.{hint} The environment's own arguments "
+                "belong in 'kwargs': env.kwargs='{…}'. Its physics cannot use preset=gpu."
+            )
     if not isinstance(node.get("id"), str):
         raise ConfigError("Which environment? Name it: env.id=…")
     module, _, plain = node["id"].rpartition(":")

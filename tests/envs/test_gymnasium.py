@@ -122,22 +122,19 @@ def test_ids_of_the_velocity_family_make_what_gymnasium_checks(name):
     assert np.array_equal(env.action_space.high, theirs.action_space.high)
 
 
-def run(envs, mode, num_steps):
-    """Everything that reset and steps return, resetting by hand where that is the mode."""
+def run(envs, num_steps):
+    """Everything that reset and steps return."""
     outcomes = [envs.reset(seed=[3, 11, 5])]
     generator = np.random.default_rng(0)
     for _ in range(num_steps):
         actions = generator.uniform(-1, 1, envs.action_space.shape).astype(np.float32)
         outcomes.append(envs.step(actions))
-        ended = outcomes[-1][2] | outcomes[-1][3]
-        if mode is AutoresetMode.DISABLED and ended.any():
-            outcomes.append(envs.reset(options={"reset_mask": ended}))
     return outcomes
 
 
 @pytest.mark.parametrize(
     ("mode", "flatten"),
-    [*((mode, True) for mode in AutoresetMode), (AutoresetMode.NEXT_STEP, False)],
+    [(AutoresetMode.SAME_STEP, True), *((AutoresetMode.NEXT_STEP, flat) for flat in (True, False))],
 )
 def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
     """Rows begin and end apart, because met goals end episodes, and have seeds of their own."""
@@ -149,8 +146,8 @@ def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
     assert ours.metadata["autoreset_mode"] is mode
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
-    outcomes = run(ours, mode, 40)
-    for got, expected in zip(outcomes, run(theirs, mode, 40), strict=True):
+    outcomes = run(ours, 40)
+    for got, expected in zip(outcomes, run(theirs, 40), strict=True):
         assert data_equivalence(got[:-1], expected[:-1], exact=True)
         # Where no world reports a key, Gymnasium leaves it out and a batch has it masked.
         reported = {key: got[-1][key] for key in expected[-1]}
@@ -161,23 +158,12 @@ def test_a_batch_is_gymnasiums_vector_of_single_worlds(mode, flatten):
     assert len({tuple(row) for row in ends.T.tolist()}) > 1
 
 
-def test_a_batch_that_is_not_reset_says_so():
-    envs = gymnasium.make_vec(
-        "Safexp-PointGoal1-v0", num_envs=2, config=SHORT, autoreset_mode="Disabled"
-    )
-    envs.reset(seed=0)
-    actions = np.zeros((2, 2), np.float32)
-    for _ in range(3):
-        envs.step(actions)
-    with pytest.raises(RuntimeError, match=r"Environments \[0, 1\] have ended.*reset_mask"):
-        envs.step(actions)
-    with pytest.raises(ValueError, match="boolean array of shape"):
-        envs.reset(options={"reset_mask": np.array([True])})
-    with pytest.raises(ValueError, match="A seed is for all environments"):
-        envs.reset(seed=1, options={"reset_mask": np.array([True, False])})
-    envs.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(RuntimeError, match=r"Environments \[1\] have ended"):
-        envs.step(actions)
+def test_a_batch_resets_rows_itself():
+    with pytest.raises(ValueError, match="NextStep or SameStep"):
+        gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=2, autoreset_mode="Disabled")
+    envs = gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=2, config=SHORT)
+    with pytest.raises(ValueError, match="no 'reset_mask'"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
 
 
 def test_some_worlds_may_get_a_seed_of_their_own():

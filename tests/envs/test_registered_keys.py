@@ -78,11 +78,6 @@ WRONG = {
     "no goal": (lambda: register_task("visit", Task(max, met=max)), "'visit'.*'goal'"),
     "many of a kind": (lambda: register_task("new", Task(max, elements=("vases",))), "'vases_num'"),
     "contacts with nothing": (lambda: cost(max, touches=("pilars",)), "'pilars'.*'pillars'"),
-    "a kind without its tuple": (lambda: cost(max, touches="pillars"), r"a text: .*\('pillars',\)"),
-    "flags without a tuple": (
-        lambda: register_cost(Cost("cost_x", ("constrain_x"), max), {"constrain_x": True}),
-        r"a text: .*\('constrain_x',\)",
-    ),
     "a flag that is no key": (
         lambda: register_observation(Reading("x", ("observe_con",), max, max)),
         "no key 'observe_con'.*'observe_com'",

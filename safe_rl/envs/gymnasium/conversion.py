@@ -82,15 +82,10 @@ def from_gymnasium(
         checked("num_steps", Count, num_steps)
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
-    if isinstance(env, str):
-        length = {} if num_steps is None else {"max_episode_steps": num_steps}
-        # the spec, because other processes may not have registered the id
-        spec = gymnasium.registry.get(env, env)
-        make: MakeEnv = partial(gymnasium.make, spec, **{**length, **kwargs})
-    else:
-        make = partial(env, **kwargs)
     config = {"cost_keys": cost_keys, "num_steps": num_steps, "outside": outside}
-    config |= {"flatten": flatten, "privileged": privileged}
+    config |= {"flatten": flatten, "privileged": privileged, "kwargs": kwargs, "render_mode": None}
+    is_id = isinstance(env, str)
+    make = _registered({"id": env, **config}) if is_id else partial(env, **kwargs)
     config["cost_keys"], config["num_steps"] = _describe(make, config)
     return _batch(make, config, num_envs, seed, device, watch=cost_keys is None)
 
@@ -225,6 +220,7 @@ def _registered(config: Mapping[str, Any]) -> MakeEnv:
             f"env.id={env_id}: {error} {did_you_mean(env_id, gymnasium.registry)} A module that "
             "registers an environment is imported by import=my_module."
         ) from error
+    # the spec, because other processes may not have registered the id
     return partial(gymnasium.make, spec, **_arguments(config))
 
 

@@ -12,13 +12,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.gym_like import BaseInfoDictReader
+from torchrl.envs import default_info_dict_reader
 
 from safe_rl.envs.keys import COST, ConfigError, is_cost
 from safe_rl.envs.pictures import chosen_rows
@@ -144,15 +143,16 @@ class CheckedSteps(gymnasium.Wrapper):
         )
 
 
-class CostReader(BaseInfoDictReader):
-    """Reads costs from `info` into the TensorDict, float32 [N, 1]; 0 where none is reported.
+class CostReader(default_info_dict_reader):
+    """TorchRL's reader of costs in `info`, which writes 0 where none is reported.
 
     Some environments report a cost only when it occurs. If no `info` of the first `patience` steps
     contains a cost, there is one warning.
     """
 
     def __init__(self, cost_keys: Sequence[str], num_envs: int, patience: int) -> None:
-        self._cost_keys, self._shape = list(cost_keys), (num_envs, 1)
+        costs = {key: Unbounded((num_envs, 1)) for key in cost_keys}
+        super().__init__(list(cost_keys), Composite(costs, shape=(num_envs,)))
         self._patience, self._num_steps = patience, 0
         self._unseen, self._names = set(cost_keys), set[str]()
 
@@ -160,10 +160,7 @@ class CostReader(BaseInfoDictReader):
         """Write the costs of a step."""
         if "reward" in tensordict and self._unseen:
             self._look_at_names(info_dict)
-        for key in self._cost_keys:
-            values = info_dict.get(key, np.zeros(self._shape))
-            tensordict[key] = torch.as_tensor(values, dtype=torch.float32).reshape(self._shape)
-        return tensordict
+        return super().__call__(info_dict, tensordict)
 
     def _look_at_names(self, info_dict: Mapping[str, Any]) -> None:
         # Gymnasium's masks begin with an underscore
@@ -173,7 +170,7 @@ class CostReader(BaseInfoDictReader):
         if self._num_steps < self._patience:
             return
         for key in sorted(self._unseen):
-            others = sorted(self._names.difference(self._cost_keys))
+            others = sorted(self._names.difference(self.keys))
             warnings.warn(
                 f"The cost '{key}' is in no info of the first {self._patience} steps, and counts "
                 f"as 0.{did_you_mean(key, others)} The infos have {', '.join(others) or 'no other'}"
@@ -181,12 +178,6 @@ class CostReader(BaseInfoDictReader):
                 stacklevel=3,
             )
         self._unseen.clear()
-
-    @property
-    def info_spec(self) -> Composite:
-        """Shapes and types of the costs."""
-        costs = {key: Unbounded(self._shape) for key in self._cost_keys}
-        return Composite(costs, shape=self._shape[:-1])
 
 
 class GymnasiumEnv(TorchRLEnv):

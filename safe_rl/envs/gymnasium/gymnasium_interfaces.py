@@ -183,15 +183,15 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         num_envs: Number of environments, N.
         name: As in `WorldEnv`.
         config: As in `WorldEnv`.
-        autoreset_mode: When a new episode follows one that ended: with the next step, within the
-            same step (`infos["final_obs"]` and `infos["final_info"]` then describe the end), or by
-            `reset(options={"reset_mask": mask})`.
+        autoreset_mode: When a new episode follows one that ended: with the next step, or within the
+            same step (`infos["final_obs"]` and `infos["final_info"]` then describe the end).
         num_threads: Threads that step the physics; 0 for one per core.
         max_episode_steps: Replaces `num_steps`; `gymnasium.make_vec` passes it on.
         settings: As in `WorldEnv`.
 
     Raises:
         ConfigError: For a configuration that cannot be used.
+        ValueError: For another mode of autoreset.
 
     Examples:
         >>> import gymnasium
@@ -222,6 +222,8 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         keys = {**(config or {}), **length}
         self._open(name, keys, num_envs=num_envs, num_threads=num_threads, **settings)
         self.num_envs, self.autoreset_mode = num_envs, AutoresetMode(autoreset_mode)
+        if self.autoreset_mode is AutoresetMode.DISABLED:
+            raise ValueError("Episodes follow each other: autoreset_mode is NextStep or SameStep.")
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self.single_observation_space, self.single_action_space = self._spaces()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -237,36 +239,23 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
             seed: An integer that determines the episodes of all environments; or N of them, one per
                 environment, which then has the episodes of `WorldEnv` with that seed. None keeps
                 the present seeds.
-            options: `reset_mask`, bool [N], restricts the reset to some environments; their seeds
-                stay what they are.
+            options: Not used.
 
         Raises:
-            ValueError: For a mask of another shape or type, for a mask together with a seed, or
-                if the number of seeds is not N.
+            ValueError: If the number of seeds is not N, or for a `reset_mask`.
         """
-        mask = np.asarray((options or {}).get("reset_mask", [True] * self.num_envs))
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(
-                f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
-                f"at least one True, got {mask!r}."
-            )
-        if seed is not None and not mask.all():
-            raise ValueError("A seed is for all environments: give a seed or a 'reset_mask'.")
+        if (options or {}).get("reset_mask") is not None:
+            raise ValueError("All environments are reset: there is no 'reset_mask'.")
         seed = seed.tolist() if isinstance(seed, np.ndarray | np.integer) else seed
         super().reset(seed=None if isinstance(seed, Sequence) else seed)
         self._seed(seed, self.np_random)
-        self._ended = self._ended & ~mask
-        return self._reset(mask), {}
+        self._ended[:] = False
+        return self._reset(~self._ended), {}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take an action [N, nu] in all environments; `autoreset_mode` says what follows an end."""
-        if self.autoreset_mode is AutoresetMode.DISABLED and self._ended.any():
-            raise RuntimeError(
-                f"Environments {np.flatnonzero(self._ended).tolist()} have ended: call "
-                "reset(options={'reset_mask': terminations | truncations}) before the next step."
-            )
         observation, (reward, terminated, truncated), infos = self._step(actions)
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
         # Environments that start an episode in this step.

@@ -6,8 +6,8 @@ The family `env=torchrl env.id=…` makes batches of N of them.
 from __future__ import annotations
 
 import inspect
-import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from operator import methodcaller
 from typing import Any
@@ -137,8 +137,8 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
         if not (width.isfinite() & (width > 0)).all():
             raise ConfigError(
                 "Every action needs finite bounds, the lower one first, because policies act in "
-                f"[-1, 1], which is scaled to them. They are {_row(spec.space.low)} and "
-                f"{_row(spec.space.high)}."
+                f"[-1, 1], which is scaled to them. They are {spec.space.low[0].tolist()} and "
+                f"{spec.space.high[0].tolist()}."
             )
         yield ActionScaling()
         yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)
@@ -152,10 +152,6 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
             "The algorithms need actions that are continuous and bounded (a Box) or choices "
             f"(Discrete, MultiDiscrete), got {type(spec).__name__} {spec.dtype}."
         )
-
-
-def _row(bounds: Tensor) -> list[float]:
-    return bounds[0].flatten().tolist()
 
 
 def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -> EnvBase:
@@ -196,17 +192,9 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
     env = _one(make)
     if not env.batch_size and not env.batch_locked:
         rows = Rows(env, num_envs)
-        try:
+        with suppress(Exception):  # of code that cannot begin several rows at once, as promised
             rows.reset()
             return rows
-        except Exception as error:  # custom code may raise any error
-            maker = make.func if hasattr(make.func, "__name__") else type(make.func)
-            if not maker.__module__.startswith("torchrl."):
-                warnings.warn(
-                    f"{maker.__name__} cannot step several rows at once, so its environments "
-                    f"are stepped one after the other. {type(error).__name__}: {error}",
-                    stacklevel=2,
-                )
     if list(env.batch_size) == [num_envs]:
         return env
     env.close(raise_if_closed=False)

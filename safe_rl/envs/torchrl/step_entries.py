@@ -124,25 +124,21 @@ class StepCosts(Transform):
                     del spec[key]
         highest = dict.fromkeys(self._ranges, 1.0)
         # an entry or a function may have written the aggregate itself
-        if COST not in highest and not self._entries and self._function is None:
-            highest[COST] = float(len(highest))
+        if not self._entries and self._function is None:
+            highest.setdefault(COST, float(len(highest)))
+        like: Any = {"device": rewards.device, "dtype": torch.float32}  # not torch's default
         for name in self.names:
-            like: dict[str, Any] = {"shape": (*rewards.shape, 1), "device": rewards.device}
-            like["dtype"] = torch.float32  # not torch's default
-            most = highest.get(name)
-            rewards[name] = Unbounded(**like) if most is None else Bounded(0.0, most, **like)
+            shape, most = (*rewards.shape, 1), highest.get(name)
+            rewards[name] = (
+                Unbounded(shape, **like) if most is None else Bounded(0.0, most, shape, **like)
+            )
         return output_spec
 
 
 def _located(given: Any) -> Callable[[TensorDictBase], Any]:
     node = dict(given) if isinstance(given, Mapping) else {"_target_": given}
-    target = node.pop("_target_", None)
-    if not isinstance(target, str):
-        raise ConfigError(
-            f"'cost' names a function: my_module:speed, or '{{_target_: my_module.speed, limit: 4}}"
-            f"' with its arguments; got {given!r}."
-        )
-    return partial(locate(target.replace(":", "."), key="env.cost"), **node)
+    target = str(node.pop("_target_", None)).replace(":", ".")
+    return partial(locate(target, key="env.cost"), **node)
 
 
 def _entry(step: TensorDictBase, name: str) -> Tensor:

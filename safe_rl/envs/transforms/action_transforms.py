@@ -88,17 +88,14 @@ class ActionFilter(ConstraintTransform):
 
     def _asked(self) -> dict[str, Any]:
         """The additional arguments of the filter, by the names of its parameters."""
-        given: dict[str, Any] = {}
-        if "layout" in self._asks_for:
-            given["layout"] = self.container.observation_layout
-        if "positions" in self._asks_for:
-            given["positions"] = self.container.get_positions()
-            if given["positions"].is_empty():
-                raise ValueError(
-                    "The action filter has a parameter 'positions', but this environment has no "
-                    "positions (get_positions)."
-                )
-        return given
+        positions = self.container.get_positions() if "positions" in self._asks_for else None
+        if positions is not None and positions.is_empty():
+            raise ValueError(
+                "The action filter has a parameter 'positions', but this environment has no "
+                "positions (get_positions)."
+            )
+        known = {"positions": positions, "layout": self.container.observation_layout}
+        return {name: known[name] for name in self._asks_for}
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         cost = self._intervened.to(next_tensordict.get("reward").dtype)

@@ -22,7 +22,6 @@ from safe_rl.envs.transforms.environment import (
     unbounded_like,
     widen,
 )
-from safe_rl.naming import did_you_mean
 
 _Range = Annotated[
     Sequence[NonNegativeFloat],
@@ -40,25 +39,18 @@ class SensorNoise(ConstraintTransform):
     Args:
         std: Standard deviation of the noise, in the units of the observation; or the lowest and
             the highest one, from which every episode draws its own.
-        components: Names of the noisy components, as in `observation_layout`; None: all.
 
     Examples:
         >>> from safe_rl.envs import make_env
-        >>> noise = SensorNoise(std=0.1, components=["hazards_lidar"])
+        >>> noise = SensorNoise(std=0.1)
         >>> env = make_env("PointGoal1", num_envs=2, seed=0, transforms={"noise": noise})
         >>> env.reset()["observation"].shape
         torch.Size([2, 60])
     """
 
-    def __init__(
-        self,
-        std: NonNegativeFloat | _Range,
-        components: Sequence[Text] | None = None,
-    ) -> None:
+    def __init__(self, std: NonNegativeFloat | _Range) -> None:
         super().__init__()
         self._std = std
-        self._components = None if components is None else list(components)
-        self._layout: dict[str, slice] = {}
         self._seeds: Tensor | None = None
 
     def seed(self, seeds: Tensor) -> None:
@@ -69,17 +61,6 @@ class SensorNoise(ConstraintTransform):
         """Restore what `rows` returned; its random keys replace a seed not yet used."""
         super().put_rows(rows)
         self._seeds = None
-
-    def extend_layout(self, layout: Mapping[str, slice]) -> dict[str, slice]:
-        """Store the columns of the components; ValueError for an unknown component."""
-        for name in self._components or ():
-            if name not in layout:
-                raise ValueError(
-                    f"components: there is no component '{name}'."
-                    f"{did_you_mean(name, layout)} There are {', '.join(layout)}."
-                )
-        self._layout = dict(layout)
-        return dict(layout)
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return the random keys of the episodes, and the step 0."""
@@ -103,31 +84,19 @@ class SensorNoise(ConstraintTransform):
         first = 0
         for name in sorted(observation.keys()):
             value = observation.get(name)
-            if self._is_noisy(name):
-                path = ("observation", name)
-                next_tensordict.set(path, self._with_noise(value, first, whole=True))
+            next_tensordict.set(("observation", name), self._with_noise(value, first))
             first += value.shape[observation.ndim :].numel()
         return next_tensordict
 
-    def _is_noisy(self, name: str) -> bool:
-        return self._components is None or name in self._components
-
-    def _with_noise(self, value: Tensor, first: int, *, whole: bool = False) -> Tensor:
-        """Add noise; integers stay unchanged.
-
-        The columns of the draws are numbered from `first`. Only the named components get noise,
-        unless the `whole` value is one of them.
-        """
+    def _with_noise(self, value: Tensor, first: int) -> Tensor:
+        """Add noise to numbers that are no integers; the draws' columns begin at `first`."""
         if not value.dtype.is_floating_point:
             return value
         key, step = self._rows["key"], self._rows["step"]
         flat = value.reshape(*key.shape[:-1], -1)
-        columns = torch.arange(flat.shape[-1], device=flat.device)
-        if self._components is not None and not whole:
-            layout = self._layout or self.container.observation_layout
-            columns = torch.cat([columns[layout[name]] for name in self._components])
-        noise = self._std_of(key) * rng.normal(key, step, columns + first)
-        return flat.index_add(-1, columns, noise.to(flat.dtype)).reshape(value.shape)
+        columns = torch.arange(first, first + flat.shape[-1], device=flat.device)
+        noise = self._std_of(key) * rng.normal(key, step, columns)
+        return (flat + noise.to(flat.dtype)).reshape(value.shape)
 
     def _std_of(self, key: Tensor) -> Tensor | float:
         if isinstance(self._std, int | float):
@@ -138,12 +107,9 @@ class SensorNoise(ConstraintTransform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Remove the bounds."""
         observed = observation_spec["observation"]
-        if not isinstance(observed, Composite):
-            observation_spec["observation"] = unbounded_like(observed)
-            return observation_spec
-        for name in list(observed.keys()):
-            if self._is_noisy(name):
-                observed[name] = unbounded_like(observed[name])
+        parts = observed if isinstance(observed, Composite) else observation_spec
+        for name in list(observed.keys()) if parts is observed else ["observation"]:
+            parts[name] = unbounded_like(parts[name])
         return observation_spec
 
 

@@ -145,12 +145,7 @@ class Saute(ConstraintTransform):
         budgets = like.new_tensor(list(self._budgets.values()))
         if not self._rescales or self._discount == 1:
             return budgets
-        steps = getattr(self.container, "max_episode_steps", None)
-        if steps is None:
-            raise ValueError(
-                "rescale_budgets needs the largest number of steps of an episode, but this "
-                "environment has no 'max_episode_steps'."
-            )
+        steps = self.container.max_episode_steps
         return budgets * (1 - self._discount**steps) / ((1 - self._discount) * steps)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
