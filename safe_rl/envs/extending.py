@@ -113,7 +113,7 @@ def register_element(element: Element, keys: Mapping[str, Any] | None = None) ->
     if element.label == element.kind and f"{element.kind}_num" in (keys or {}):
         raise ConfigError(
             f"There is only one object if 'label' and 'kind' are both '{element.kind}': give "
-            f"another label, or remove '{element.kind}_num'."
+            "another label, or no number of objects."
         )
     _add_keys(keys, standard)
     # Rows of one motion stand together, because slots, bodies and `qpos` are in their order.

@@ -13,7 +13,12 @@ from torch import Tensor
 from torchrl.envs import GymWrapper
 
 from safe_rl.envs.foreign import FOREIGN, complete_foreign
-from safe_rl.envs.gymnasium.gymnasium_env import CostReader, GymnasiumEnv, make_adapted
+from safe_rl.envs.gymnasium.gymnasium_env import (
+    CheckedSteps,
+    CostReader,
+    GymnasiumEnv,
+    make_adapted,
+)
 from safe_rl.envs.keys import ConfigError, Count, checked, is_cost
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
@@ -65,7 +70,7 @@ def from_gymnasium(
 
     Returns:
         An environment [N] with the costs in its reward spec. Without a cost named `cost`, the sum
-        of the others gets this name. A copy (`copy`, `pickle`) continues the present episodes if
+        of the others gets this name. A copy (`copy.deepcopy`) continues the present episodes if
         copies of the Gymnasium environments do.
 
     Raises:
@@ -105,7 +110,6 @@ def _batch(
     is_vector = config["flatten"] and config["privileged"] is None
     make_one = partial(make_adapted, make, length, is_vector, keys, watch)
     worlds = SyncVectorEnv([make_one] * num_envs, autoreset_mode=AutoresetMode.DISABLED)
-    worlds.env_fns = ()  # not needed again, and pickle may refuse them
     base = _PartlyReset(worlds, device=torch.device(device), categorical_action_encoding=True)
     entries = list(map(dotted, base.observation_spec.keys(True, True)))
     observe = [name for name in entries if name != config["privileged"]]
@@ -180,11 +184,10 @@ def _describe(make: MakeEnv, config: Mapping[str, Any]) -> tuple[list[str], int]
         keys = _find_costs(probe) if keys is None else list(keys)
         if not keys and config["cost_keys"] is None and not config["outside"]:
             raise ValueError(
-                f"{probe.unwrapped} reports no costs: there is no 'cost' or 'cost_<kind>' in its "
-                "info. If a cost has another name, or is not reported at every step, name it in "
-                "'cost_keys'. To give a cost to every step that leaves a range, use 'outside': "
-                "env.outside='{cost_position: [0, -0.5, 0.5]}'. An algorithm without constraints "
-                "needs no costs: with env.cost_keys=[cost] algo=ppo, a missing cost counts as 0."
+                f"{probe.unwrapped} reports no costs: its info has no 'cost' or 'cost_<kind>'. If "
+                "one has another name, or is not in every info, name it in 'cost_keys'. Leaving a "
+                "range can cost, too: env.outside='{cost_position: [0, -0.5, 0.5]}'. Without "
+                "constraints use env.cost_keys=[cost] algo=ppo: a missing cost counts as 0."
             )
         task, spec = _task_of(probe), probe.spec
         limits = getattr(task, "num_steps", None), spec and spec.max_episode_steps
@@ -197,10 +200,9 @@ def _describe(make: MakeEnv, config: Mapping[str, Any]) -> tuple[list[str], int]
 
 
 def _find_costs(probe: gymnasium.Env) -> list[str]:
-    adapted = make_adapted(lambda: probe, 1, True, [])  # it checks the number of values
-    adapted.action_space.seed(0)
-    adapted.reset(seed=0)
-    *_, info = adapted.step(adapted.action_space.sample())
+    probe.action_space.seed(0)
+    probe.reset(seed=0)
+    *_, info = CheckedSteps(probe, [], watch=False).step(probe.action_space.sample())
     return [key for key in info if is_cost(key)]
 
 
@@ -230,10 +232,9 @@ def _of_safety_gymnasium(config: Mapping[str, Any]) -> MakeEnv:
         import safety_gymnasium
     except ImportError as error:
         raise ConfigError(
-            f"Safety-Gymnasium cannot be imported in this Python ({error}). Its release 1.0 needs "
-            "older releases of Gymnasium and MuJoCo than safe_rl; install a release that can be "
-            "imported beside safe_rl. Your own environments with six values do not need the "
-            "package: use from_gymnasium."
+            f"Safety-Gymnasium cannot be imported in this Python ({error}); its release 1.0 needs "
+            "older releases of Gymnasium and MuJoCo than safe_rl. Your own environments with six "
+            "values do not need the package: use from_gymnasium."
         ) from error
 
     def make() -> gymnasium.Env:

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
-from gymnasium.wrappers import TimeLimit, TransformAction, TransformObservation
+from gymnasium.wrappers import FlattenObservation, TimeLimit, TransformAction
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import default_info_dict_reader
@@ -37,14 +37,12 @@ def make_adapted(
 ) -> gymnasium.Env:
     """Make an environment whose choices start at 0 and whose costs in `info` are floats.
 
-    Episodes are truncated after `num_steps`. With `flatten`, observations are float32 vectors.
+    Episodes are truncated after `num_steps`. With `flatten`, observations are vectors.
     """
     env: gymnasium.Env = CheckedSteps(make(), cost_keys, watch)
     seen, actions = env.observation_space, env.action_space
     if flatten:
-        # Gymnasium's own wrapper, FlattenObservation, contains lambdas and cannot be pickled
-        space = Box(-np.inf, np.inf, (spaces.flatdim(seen),), np.float32)
-        env = TransformObservation(env, partial(_vector, seen), space)
+        env = FlattenObservation(env)
     elif isinstance(seen, spaces.Tuple):
         raise ConfigError("The observation is a Tuple: set flatten=true, which makes one vector.")
     elif taken := {*_WRITTEN, *cost_keys} & {*(seen if isinstance(seen, spaces.Dict) else ())}:
@@ -58,10 +56,6 @@ def make_adapted(
         )
         env = TransformAction(env, partial(np.add, actions.start), choices)
     return TimeLimit(env, num_steps)
-
-
-def _vector(space: gymnasium.Space, observation: Any) -> np.ndarray:
-    return np.asarray(spaces.flatten(space, observation)).astype(np.float32)
 
 
 class CheckedSteps(gymnasium.Wrapper):

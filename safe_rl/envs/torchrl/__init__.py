@@ -136,9 +136,8 @@ def _plain_actions(env: EnvBase) -> Iterator[Transform]:
         width = spec.space.high - spec.space.low
         if not (width.isfinite() & (width > 0)).all():
             raise ConfigError(
-                "Every action needs finite bounds, the lower one first, because policies act in "
-                f"[-1, 1], which is scaled to them. They are {spec.space.low[0].tolist()} and "
-                f"{spec.space.high[0].tolist()}."
+                "Every action needs finite bounds, to which [-1, 1] is scaled; they are "
+                f"{spec.space.low[0].tolist()} and {spec.space.high[0].tolist()}."
             )
         yield ActionScaling()
         yield ClipTransform(in_keys_inv=["action"], low=-1.0, high=1.0)
@@ -166,9 +165,8 @@ def _tried(config: Mapping[str, Any], make_some: Callable[[MakeEnv], EnvBase]) -
     else:
         raise ConfigError(
             f"env.id={name} is not among {', '.join(TORCHRL_CLASSES)}."
-            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class of TorchRL use "
-            "import=torchrl.envs env.id=torchrl.envs.NAME, for a class of yours import=my_module "
-            "env.id=my_module.NAME, and for a Gymnasium environment env=gymnasium and its id."
+            f"{did_you_mean(name, TORCHRL_CLASSES)} For another class use import=torchrl.envs "
+            "env.id=torchrl.envs.NAME, or import=my_module env.id=my_module.NAME."
         )
     try:
         return make_some(make)

@@ -56,9 +56,8 @@ class StepCosts(Transform):
         self._function = None if config["cost"] is None else _located(config["cost"])
         if not (self._entries or self._ranges or self._function):
             raise ConfigError(
-                "what does a step cost? Name entries that are costs (env.cost_keys=[…]), a range "
-                "that an entry must not leave (env.outside='{cost_speed: [thdot, -4, 4]}'), or "
-                "your own function (import=my_module env.cost=my_module:speed)."
+                "what does a step cost? Name entries (env.cost_keys=[…]), a range "
+                "(env.outside='{cost_speed: [thdot, -4, 4]}'), or a function (env.cost)."
             )
         needed = [env.full_state_spec, env.full_action_spec, env.full_done_spec]
         kept = {"reward", *(key for spec in needed for key in spec.keys(True, True))}
@@ -66,7 +65,7 @@ class StepCosts(Transform):
             if key in kept:
                 raise ConfigError(
                     f"env.cost_keys: '{name}' is a state, an action, a reward or an end, and stays "
-                    "one. Compute a cost from it by env.outside, or your own function (env.cost)."
+                    "one. Compute a cost from it by env.outside or env.cost."
                 )
         self.names = list(self._costs(env.fake_tensordict()))
 

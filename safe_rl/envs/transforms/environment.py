@@ -27,7 +27,7 @@ _STATE = "transforms"
 # Attributes of the inner environment, which the defaults of `ConstrainedEnv` would hide.
 _INNER = (
     *("max_episode_steps", "seconds_per_step", "events", "sensor_keys", "return_key"),
-    *("reuses_tensors", "steps_after_end", "privileged_layout"),
+    *("reuses_tensors", "steps_after_end", "privileged_layout", "get_positions", "render"),
 )
 
 
@@ -167,11 +167,6 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         self._seed_transforms(seed)
 
     @property
-    def render(self) -> Any:
-        """The inner environment's method that draws it; None if it draws no pictures."""
-        return self.base_env.render
-
-    @property
     def action_bounds(self) -> tuple[Tensor, Tensor] | None:
         """Bounds of the inner environment's own units."""
         return self.base_env.action_bounds
@@ -191,10 +186,6 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         for transform in self._ours.values():
             highest = transform.highest_cost(key, highest, of_a_step)
         return highest
-
-    def get_positions(self) -> TensorDictBase:
-        """Return the positions of the inner environment."""
-        return self.base_env.get_positions()
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed all later random draws of the environment and of its transforms."""
