@@ -39,6 +39,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     """Write a policy to a file, or to a folder."""
     # imported here: help and errors about options do not need torch
     from safe_rl.cli.python_api import Run
+    from safe_rl.evaluation.loading import transforms_of
     from safe_rl.evaluation.policies import export_onnx, find_run, pack_policy
 
     import_modules(modules)
@@ -53,6 +54,11 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         sampled = _choose_actions(run, checkpoint, options.actions)
         with closing(run.make_env()) as env:
             export_onnx(run, env, checkpoint, target, sampled=sampled)
+        if names := ", ".join(transforms_of(run.config)):
+            print(
+                f"The file has the policy without the transforms {names}: your program has to do "
+                "what they do (see its metadata), and a certificate is about both together."
+            )
     else:
         target = pack_policy(run.directory, target, which)
     print(f"wrote {target}")

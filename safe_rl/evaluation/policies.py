@@ -193,19 +193,22 @@ def _about(run: Run, env: EnvBase, checkpoint: Path, *, sampled: bool) -> dict[s
     if certificate is not None and is_sampled(certificate) != sampled:
         certificate = None  # it is about other actions
     kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
-    low, high = env.action_bounds
+    covered = {key: certificate.get(key) for key in kept} if certificate else None
+    transforms, (low, high) = transforms_of(config), env.action_bounds
     return {
         "observation": env.column_names,
+        "costs": list(env.cost_keys),
         "action_low": low.tolist(),
         "action_high": high.tolist(),
         "steps_per_action": env.steps_per_decision,
         "environment": OmegaConf.to_container(config.env, resolve=True),
-        "transforms": transforms_of(config),
+        "transforms": transforms,
         "cost_limits": OmegaConf.to_container(config.cost_limits, resolve=True),
         "algorithm": run.algorithm,
         "steps": checkpoint_steps(checkpoint),
         "commit": run.commit,
-        "certificate": certificate and {key: certificate.get(key) for key in kept},
+        # the tested environment had these transforms, and the file has none of them
+        "certificate": covered and {**covered, "transforms": list(transforms)},
         "actions": "sampled" if sampled else "mean",
     }
 

@@ -179,6 +179,26 @@ def test_an_exported_policy_acts_in_the_environment_itself(family, algo, tmp_pat
     assert policy.about["environment"]["name"] == run.config.env.name
 
 
+def test_an_exported_policy_says_which_transforms_its_program_needs(tmp_path, capsys):
+    small = {"frames": 40, "num_envs": 2, "frames_per_batch": 40, "logger": "none"}
+    small |= {"env.id": "Tank-v0", "env.outside": {"cost_full": [0, 0, 1]}}
+    run = safe_rl.train(
+        "gymnasium", directory=tmp_path / "run", transforms=["observed_costs"], **small
+    )
+    certified(run.directory, True)
+    session = exported(run.directory, tmp_path / "policy.onnx")
+    assert "without the transforms observed_costs:" in capsys.readouterr().out
+    texts = session.get_modelmeta().custom_metadata_map
+    assert json.loads(texts["certificate"])["transforms"] == ["observed_costs"]
+    # the names of the costs that a program has to observe, in their order
+    steps, names = run.env.rollout(20)["next"], json.loads(texts["costs"])
+    columns = json.loads(texts["observation"])
+    seen = [columns.index(f"last_costs[{number}]") for number in range(len(names))]
+    expected = torch.cat([steps[name] for name in names], -1)
+    assert torch.equal(steps["observation"][..., seen], expected)
+    assert (expected.sum(1) > 0).any()
+
+
 def certified(run, deterministic):
     shutil.copytree(run / "checkpoints/last", run / "checkpoints/certified", dirs_exist_ok=True)
     content = {"certified": True, "deterministic": deterministic, "level": 0.95, "bounds": {}}
