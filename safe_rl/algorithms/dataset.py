@@ -101,8 +101,9 @@ def _fill(
         )
     costs = [("next", key) for key in env.cost_keys if ("next", key) in steps.keys(True)]
     check_steps({key: steps[key] for key in {*buffer.in_keys, *costs}}, costs)
-    warning = "" if is_recorded else _check_costs_and_ends(steps, env)
-    warning += _order_columns(steps, interface, node, env)
+    if not is_recorded:
+        _check_costs_and_ends(steps, env)
+    warning = _order_columns(steps, interface, node, env)
     number = steps.batch_size.numel()
     if node.safe_episodes:
         if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
@@ -122,26 +123,17 @@ def _fill(
     return f"Learning from {taken:,} of {number:,} transitions in {node.path}: {kept}.{warning}"
 
 
-def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> str:
-    """Refuse steps [1, M] of a file whose costs or ends cannot be what they are here.
-
-    Returns:
-        A warning of a cost that can be a sum over its kinds, as Safety-Gymnasium has it, or "".
-    """
-    warning, no_bound = "", torch.tensor(math.inf)
-    specs = {key: env.full_reward_spec[key] for key in env.cost_keys}
-    bounds = {key: float(getattr(s, "high", no_bound).max()) for key, s in specs.items()}
-    for key, highest in bounds.items():
+def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> None:
+    """Refuse steps [1, M] of a file whose costs or ends cannot be what they are here."""
+    for key in env.cost_keys:
+        highest = float(getattr(env.full_reward_spec[key], "high", torch.tensor(math.inf)).max())
         found = float(steps["next"].get(key, torch.zeros(1)).max())
-        if found <= highest * (1 + _ROUNDING):
-            continue
-        says = f"its {key} is up to {found:g} in a step, that of this environment {highest:g}"
-        if found > sum(bounds.values()) - highest:
+        if found > highest * (1 + _ROUNDING):
             raise ValueError(
-                f"{says}. Costs are those of single steps, not sums over an episode: rescale or "
-                "clip them."
+                f"its {key} is up to {found:g} in a step, that of this environment {highest:g}. "
+                "Costs are those of single steps, not sums over an episode or over kinds: rescale "
+                "or clip them."
             )
-        warning = f" Warning: {says}: it may be the sum of several kinds."
     ends = steps["next", "done"].flatten().nonzero().flatten()
     lengths = ends.diff(prepend=ends.new_tensor([-1]))
     terminated = lengths[steps["next", "terminated"].flatten()[ends]]
@@ -150,7 +142,6 @@ def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> str:
             f"all episodes that terminate have {env.max_episode_steps} steps, so these are "
             "time-outs, after which values are bootstrapped: mark them in timeouts only."
         )
-    return warning
 
 
 def _order_columns(
