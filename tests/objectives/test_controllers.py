@@ -1,9 +1,12 @@
 """PI and PID multipliers by hand, PID by Stooke et al. (algorithm 2)."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
+from run_configs import compose_config
 
 from safe_rl.objectives import LimitState
 from safe_rl.objectives.multipliers import PIDMultiplier, PIMultiplier
@@ -99,3 +102,17 @@ def test_costs_are_controlled_separately():
     first = run([14.0, 11.0], limits=10.0, kp=0.1, ki=0.05, kd=0.02)
     second = run([1.0, 9.0], limits=4.0, kp=0.1, ki=0.05, kd=0.02)
     torch.testing.assert_close(torch.tensor(both).T, torch.tensor([first, second]))
+
+
+def test_the_controller_of_fsrl_is_translated():
+    """The page's words give the multiplier of `LagrangianOptimizer` (fsrl/utils/optim_util.py)."""
+    page = (Path(__file__).parents[2] / "docs/coming_from/fsrl.md").read_text()
+    words = re.search(r"`--lagrangian_pid 0\.05 0\.0005 0\.1` \| `(.*?)`", page)[1].split()
+    settings = {k: v for k, v in compose_config(*words).lagrangian.items() if k != "_target_"}
+    costs, expected, old, integral = [30.0, 60.0, 20.0, 45.0], [], 0.0, 0.0
+    for error in (cost - 25.0 for cost in costs):
+        integral = max(0.0, integral + error)
+        rise, old = max(0.0, error - old), error
+        expected.append(max(0.0, 0.05 * error + 0.0005 * integral + 0.1 * rise))
+    # the first rise is that from an error of 0 there, and from a cost of 0 here
+    assert run(costs, 25.0, **settings)[1:] == pytest.approx(expected[1:], abs=1e-6)
