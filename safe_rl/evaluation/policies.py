@@ -192,7 +192,7 @@ def _about(run: Run, env: EnvBase, checkpoint: Path, *, sampled: bool) -> dict[s
     config, certificate = run.config, run.certificate_of(checkpoint)
     if certificate is not None and is_sampled(certificate) != sampled:
         certificate = None  # it is about other actions
-    kept = ("level", "bounds", "bound", "episodes", "deterministic", "checkpoint")
+    kept = ("level", "bounds", "bound", "episodes", "checkpoint")
     covered = {key: certificate.get(key) for key in kept} if certificate else None
     transforms, (low, high) = transforms_of(config), env.action_bounds
     return {

@@ -151,7 +151,7 @@ def test_the_next_observation_is_never_the_next_episodes(leave_out, tmp_path, h5
 
 
 def write_minari(h5py, path, lengths=(3, 12), reset_infos=True):
-    """Twelve episodes are needed for names in another order than numbers; the rest have a step."""
+    """As minari/dataset/_storages/hdf5_storage.py; twelve: names in another order than numbers."""
     rng = np.random.default_rng(0)
     episodes = []
     with h5py.File(path, "w") as file:

@@ -189,7 +189,9 @@ def test_an_exported_policy_says_which_transforms_its_program_needs(tmp_path, ca
     session = exported(run.directory, tmp_path / "policy.onnx")
     assert "without the transforms observed_costs:" in capsys.readouterr().out
     texts = session.get_modelmeta().custom_metadata_map
-    assert json.loads(texts["certificate"])["transforms"] == ["observed_costs"]
+    certificate = json.loads(texts["certificate"])
+    assert certificate["transforms"] == ["observed_costs"]
+    assert "deterministic" not in certificate  # which older ones lack: `actions` says it
     # the names of the costs that a program has to observe, in their order
     steps, names = run.env.rollout(20)["next"], json.loads(texts["costs"])
     columns = json.loads(texts["observation"])
