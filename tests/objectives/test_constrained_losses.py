@@ -85,8 +85,10 @@ def test_they_compile(name):
     batch = make_batch(actor, [16], 2)
     perturb(actor, 0.1)
     loss = LOSSES[name](actor)
+    # before compiling: torch finds the function of a divergence once, which Dynamo cannot trace
+    expected = dict(loss(batch))
     compiled = torch.compile(loss, fullgraph=True, backend="eager")(batch)
-    torch.testing.assert_close(dict(compiled), dict(loss(batch)))
+    torch.testing.assert_close(dict(compiled), expected)
 
 
 @pytest.mark.parametrize("name", LOSSES)
