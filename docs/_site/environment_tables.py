@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -29,11 +30,7 @@ COMPONENTS = {
     "ballquat_.*": ("1", "rotation matrix of a ball joint, 3 × 3", "sensors_ball_joints"),
     "jointvel_.*": ("rad/s", "speed of a hinge", "sensors_hinge_joints"),
     "jointpos_.*": ("1", "sine and cosine of a hinge's angle", "sensors_hinge_joints"),
-    ".*_lidar": (
-        "1",
-        "0 to 1: closeness of the nearest",
-        "observe_<kind>, lidar_num_bins",
-    ),
+    ".*_lidar": ("1", "0 to 1: closeness of the nearest", "observe_<kind>, lidar_num_bins"),
     ".*_compass": ("1", "unit vector in the robot's frame", "observe_goal_comp, observe_box_comp"),
     "goal_dist": ("1", "e to the minus distance to the goal [m]", "observe_goal_dist"),
     "remaining": ("1", "share of the episode's steps taken so far", "observe_remaining"),
@@ -118,9 +115,8 @@ def _words(schema: Mapping[str, Any]) -> str:
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
     if schema["type"] == "array":
-        items = schema.get("prefixItems", ())
-        number = f"{len(items)} times " if items else ""
-        return f"list of {number}{_words(items[0] if items else schema['items'])}"
+        items = schema.get("prefixItems") or [schema["items"]]
+        return f"list of {f'{len(items)} times ' if items[1:] else ''}{_words(items[0])}"
     words = {"string": "text", "boolean": "true or false"}.get(schema["type"], schema["type"])
     for name, word in {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to"}.items():
         if abs(schema.get(name, 1e9)) < 1e9:
@@ -130,28 +126,24 @@ def _words(schema: Mapping[str, Any]) -> str:
 
 def observations() -> str:
     """Components of the observation: sizes, units, meaning."""
-    found: dict[str, tuple[int, set[str]]] = {}
+    sizes, robots, rows = dict[str, int](), defaultdict[str, set[str]](set), []
     for label, env in _observed():
         for name, columns in env.observation_layout.items():
-            known = (columns.stop - columns.start, set[str]())
-            found.setdefault(name, known)[1].add(label)
-    rows = []
+            sizes.setdefault(name, columns.stop - columns.start)
+            robots[name] |= {*_NAMES} if label == "any" else {label}
     for pattern, (unit, meaning, told) in COMPONENTS.items():
-        for shown, group in _alike([name for name in found if component_of(name) == pattern]):
+        for shown, group in _alike([name for name in sizes if component_of(name) == pattern]):
             flags = ", ".join(f"`{key}`" for key in told.split(", ") if key)
-            who = set().union(*(found[name][1] for name in group))
-            everyone = "any" in who or len(who) == len(_NAMES)
-            of = "all" if everyone else ", ".join(name for name in _NAMES if name in who)
-            rows.append((f"`{shown}`", found[group[0]][0], unit, meaning, flags, of))
+            who = [name for name in _NAMES if any(name in robots[part] for part in group)]
+            of = "all" if len(who) == len(_NAMES) else ", ".join(who)
+            rows.append((f"`{shown}`", sizes[group[0]], unit, meaning, flags, of))
     return table(["component", "size", "unit", "meaning", "keys", "robots"], rows)
 
 
 def component_of(name: str) -> str:
     """The pattern in `COMPONENTS` that explains a component; KeyError if there is none."""
-    for pattern in COMPONENTS:
-        if re.fullmatch(pattern, name):
-            return pattern
-    raise KeyError(f"docs/_site/environment_tables.py explains no component '{name}'")
+    found = [pattern for pattern in COMPONENTS if re.fullmatch(pattern, name)]
+    return found[0] if found else COMPONENTS[name]  # a KeyError that names it
 
 
 def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
@@ -160,8 +152,7 @@ def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
         for name in ("Goal2", "Button2", "Push2", "Circle"):
             yield robot, SafetyGymEnv(f"{robot}{name}", num_envs=1)
     shown = ("goal_comp", "box_comp", "goal_dist", "remaining", "com", "ctrl", "qpos", "qvel")
-    everything = {f"observe_{name}": True for name in shown}
-    everything |= {"task": "push", "observation_flatten": True}
+    everything = {"task": "push"} | {f"observe_{name}": True for name in shown}
     yield "any", SafetyGymEnv(everything | {"robot_base": "point"}, num_envs=1)
     yield "Car", SafetyGymEnv(everything | {"robot_base": "car", "observe_freejoint": True}, 1)
     yield "any", SafetyGymEnv({"robot_base": "point", "task": "goal", "observe_vision": True}, 1)
@@ -169,11 +160,8 @@ def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:
 
 def _alike(names: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Names that differ in numbers and ends only, under one: `touch_ankle_<…>`."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        stem = re.sub(r"(?<=_)\d.*$|^.*(?=_(lidar|compass)$)", "…", name)
-        groups.setdefault(stem, []).append(name)
-    return list(groups.items())
+    stems = {name: re.sub(r"(?<=_)\d.*$|^.*(?=_(lidar|compass)$)", "…", name) for name in names}
+    return [(s, [n for n in names if stems[n] == s]) for s in dict.fromkeys(stems.values())]
 
 
 def costs() -> str:
