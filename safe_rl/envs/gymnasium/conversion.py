@@ -89,8 +89,8 @@ def from_gymnasium(
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
     config = {"cost_keys": cost_keys, "num_steps": num_steps, "outside": outside}
     config |= {"flatten": flatten, "privileged": privileged, "kwargs": kwargs, "render_mode": None}
-    is_id = isinstance(env, str)
-    make = _registered({"id": env, **config}) if is_id else partial(env, **kwargs)
+    node = {"id": env, **config}
+    make = _registered(node) if isinstance(env, str) else partial(env, **kwargs)
     config["cost_keys"], config["num_steps"] = _describe(make, config)
     return _batch(make, config, num_envs, seed, device, watch=cost_keys is None)
 

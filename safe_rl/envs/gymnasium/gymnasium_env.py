@@ -116,8 +116,9 @@ class CheckedSteps(gymnasium.Wrapper):
     def _check(self, name: str, space: gymnasium.Space, value: Any) -> None:
         """Check shapes, types and choices; numbers of a Box may be outside its bounds."""
         if isinstance(space, spaces.Dict | spaces.Tuple):
-            for key in space if isinstance(space, spaces.Dict) else range(len(space)):
-                self._check(f"{name}[{key!r}]", space[key], value[key])
+            parts: Any = space.spaces
+            for key in parts if isinstance(parts, dict) else range(len(parts)):
+                self._check(f"{name}[{key!r}]", parts[key], value[key])
             return
         array = np.asarray(value)
         is_array = array.shape == space.shape and array.dtype.kind in "fiub"

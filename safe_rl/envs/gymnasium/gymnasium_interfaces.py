@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -18,6 +18,7 @@ from torchrl.data import Composite, TensorSpec
 
 from safe_rl.envs.families import env_node, make_env
 from safe_rl.envs.keys import COST
+from safe_rl.envs.simulated import SimulatedEnv
 
 EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
 NUM_SEEDS = 2**62
@@ -37,7 +38,7 @@ class Worlds:
         batch: The batched environment inside.
     """
 
-    batch: Any  # a `SimulatedEnv`
+    batch: SimulatedEnv
     _spec: EnvSpec | None = None
     _is_seeded = False
 
@@ -56,7 +57,8 @@ class Worlds:
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         node = {**({} if name is None else env_node(name)), **(config or {})}
-        self.batch = make_env(node, num_envs=num_envs, seed=0, num_threads=num_threads)
+        batch = make_env(node, num_envs=num_envs, seed=0, num_threads=num_threads)
+        self.batch = cast(SimulatedEnv, batch)
         self.render_mode = render_mode
         self._view: dict[str, Any] = {"camera": camera, "width": width, "height": height}
         self._episode_cost = np.zeros(num_envs)  # since the last reset
