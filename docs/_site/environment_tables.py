@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -30,7 +29,7 @@ COMPONENTS = {
     "ballquat_.*": ("1", "rotation matrix of a ball joint, 3 × 3", "sensors_ball_joints"),
     "jointvel_.*": ("rad/s", "speed of a hinge", "sensors_hinge_joints"),
     "jointpos_.*": ("1", "sine and cosine of a hinge's angle", "sensors_hinge_joints"),
-    ".*_lidar": ("1", "0 to 1: closeness of the nearest", "observe_<kind>, lidar_num_bins"),
+    ".*_lidar": ("1", "closeness of the nearest, by direction", "observe_<kind>, lidar_num_bins"),
     ".*_compass": ("1", "unit vector in the robot's frame", "observe_goal_comp, observe_box_comp"),
     "goal_dist": ("1", "e to the minus distance to the goal [m]", "observe_goal_dist"),
     "remaining": ("1", "share of the episode's steps taken so far", "observe_remaining"),
@@ -39,7 +38,7 @@ COMPONENTS = {
     "freejoint": ("m, 1", "position and quaternion of a free root", "observe_freejoint"),
     "qpos": ("m, rad, 1", "positions of all joints (`qpos` of MuJoCo)", "observe_qpos"),
     "qvel": ("m/s, rad/s", "velocities of all joints (`qvel` of MuJoCo)", "observe_qvel"),
-    "vision": ("1", "0 to 1: camera image, height × width × 3", "observe_vision"),
+    "vision": ("1", "image of the robot's camera, height × width × 3", "observe_vision"),
 }
 COST_MEANINGS = {
     "cost": "any of the others is",
@@ -78,8 +77,7 @@ def _suite_table(names: Iterable[str]) -> str:
 
 
 def _sizes(env: SafetyGymEnv | VelocityEnv) -> tuple[int, int]:
-    columns = env.observation_layout.values()
-    return max(part.stop for part in columns), env.action_spec.shape[-1]
+    return max(c.stop for c in env.observation_layout.values()), env.action_spec.shape[-1]
 
 
 def velocity() -> str:
@@ -125,25 +123,27 @@ def _words(schema: Mapping[str, Any]) -> str:
 
 
 def observations() -> str:
-    """Components of the observation: sizes, units, meaning."""
-    sizes, robots, rows = dict[str, int](), defaultdict[str, set[str]](set), []
+    """Components of the observation: sizes, ranges, units, meaning."""
+    ranges, robots, rows = dict[str, tuple](), dict[str, set[str]](), []
     for label, env in _observed():
+        space = env.observation_spec["observation"].space
         for name, columns in env.observation_layout.items():
-            sizes.setdefault(name, columns.stop - columns.start)
-            robots[name] |= {*_NAMES} if label == "any" else {label}
+            low, high = (float(end[0, columns.start]) for end in (space.low, space.high))
+            shown = "any" if high > 1e38 else f"[{low:g}, {high:g}]"
+            ranges.setdefault(name, (columns.stop - columns.start, shown))
+            robots.setdefault(name, set()).update(_NAMES if label == "any" else [label])
     for pattern, (unit, meaning, told) in COMPONENTS.items():
-        for shown, group in _alike([name for name in sizes if component_of(name) == pattern]):
+        for shown, group in _alike([name for name in ranges if component_of(name) == pattern]):
             flags = ", ".join(f"`{key}`" for key in told.split(", ") if key)
             who = [name for name in _NAMES if any(name in robots[part] for part in group)]
             of = "all" if len(who) == len(_NAMES) else ", ".join(who)
-            rows.append((f"`{shown}`", sizes[group[0]], unit, meaning, flags, of))
-    return table(["component", "size", "unit", "meaning", "keys", "robots"], rows)
+            rows.append((f"`{shown}`", *ranges[group[0]], unit, meaning, flags, of))
+    return table(["component", "size", "range", "unit", "meaning", "keys", "robots"], rows)
 
 
 def component_of(name: str) -> str:
     """The pattern in `COMPONENTS` that explains a component; KeyError if there is none."""
-    found = [pattern for pattern in COMPONENTS if re.fullmatch(pattern, name)]
-    return found[0] if found else COMPONENTS[name]  # a KeyError that names it
+    return next((p for p in COMPONENTS if re.fullmatch(p, name)), None) or COMPONENTS[name][0]
 
 
 def _observed() -> Iterable[tuple[str, SafetyGymEnv]]:

@@ -41,7 +41,8 @@ def test_every_environment_and_cost_has_its_row():
 
 def test_every_component_of_the_observation_is_explained():
     rows = cells(environment_tables.observations())
-    assert "| 3 | m/s² |" in rows["accelerometer"]
+    assert "| 3 | any | m/s² |" in rows["accelerometer"]
+    assert "[0, 1]" in rows["…_lidar"]
     with pytest.raises(KeyError, match="smell"):
         environment_tables.component_of("smell")
 

@@ -178,11 +178,23 @@ def test_some_worlds_may_get_a_seed_of_their_own():
 
 
 @pytest.mark.parametrize("flatten", [True, False])
-def test_observations_are_in_their_space(flatten):
-    config = {"observation_flatten": flatten, "observe_goal_comp": True, "compass_shape": 3}
+def test_bounds_are_true(flatten):
+    config = {
+        **{"observation_flatten": flatten, "observe_goal_comp": True, "observe_goal_dist": True},
+        **{"observe_remaining": True, "compass_shape": 3},
+    }
     envs = gymnasium.make_vec("Safexp-CarGoal2-v0", num_envs=20, config=config)
+    bounds = {"goal_compass": (-1, 1), "goal_dist": (0, 1)}
+    bounds |= {f"{kind}_lidar": (0, 1) for kind in ("goal", "hazards", "vases")}
+    env, space = envs.batch, envs.single_observation_space
     observation, _ = envs.reset(seed=0)
-    for _ in range(5):
+    for name, columns in env.observation_layout.items():
+        box = space if flatten else space[name]
+        rows = columns if flatten else slice(None)
+        low, high = bounds.get(name, (-np.inf, np.inf))
+        assert (box.low[rows] == low).all(), name
+        assert (box.high[rows] == high).all(), name
+    for _ in range(50):
         assert observation in envs.observation_space
         observation, *_ = envs.step(envs.action_space.sample())
 

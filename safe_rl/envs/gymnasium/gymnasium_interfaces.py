@@ -80,8 +80,8 @@ class Worlds:
         ends = self.batch.action_spec.space
         actions = Box(ends.low[0].cpu().numpy(), ends.high[0].cpu().numpy(), dtype=np.float32)
         if isinstance(seen, Composite):
-            return Dict({name: _any_numbers(part) for name, part in seen.items()}), actions
-        return _any_numbers(seen), actions
+            return Dict({name: _box(part) for name, part in seen.items()}), actions
+        return _box(seen), actions
 
     def _seed(self, seed: int | Sequence[int | None] | None, generator: Any) -> None:
         """Seed all later episodes; without a seed, the first call draws one."""
@@ -283,8 +283,12 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         self.batch.close()
 
 
-def _any_numbers(spec: TensorSpec) -> Box:
-    return Box(-np.inf, np.inf, spec.shape[1:], np.float32)
+def _box(spec: TensorSpec) -> Box:
+    """The space of one row of a spec."""
+    ends = (spec.space.low[0].cpu().numpy(), spec.space.high[0].cpu().numpy())
+    # a spec has half of the largest number in place of infinity, see `observation_spec`
+    low, high = (np.where(abs(end) < 1e38, end, np.copysign(np.inf, end)) for end in ends)
+    return Box(low, high, dtype=np.float32)
 
 
 def _arrays(observation: torch.Tensor | TensorDictBase) -> Observation:

@@ -114,7 +114,7 @@ def lidar_blocks(scene: Scene, device: torch.device) -> list[Block]:
     if "buttons" in kinds:
         first = kinds.index("buttons") * bins
         read = partial(_read_awake, read, slice(first, first + bins))
-    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read)]
+    return [Block({f"{kind}_lidar": (bins,) for kind in kinds}, read, (0.0, 1.0))]
 
 
 def _read_awake(read: Callable[[World], Tensor], columns: slice, world: World) -> Tensor:

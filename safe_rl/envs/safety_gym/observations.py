@@ -11,19 +11,19 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import torch
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs.contract import add_columns
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.lidar import lidar_blocks
 from safe_rl.envs.safety_gym.tasks import TASKS, goal_distance
-from safe_rl.envs.safety_gym.world import Block, Scene, Shapes, World
+from safe_rl.envs.safety_gym.world import UNBOUNDED, Block, Bounds, Scene, Shapes, World
 from safe_rl.naming import did_you_mean
 
 
@@ -36,6 +36,7 @@ class Reading(NamedTuple):
         size: Number of values.
         read: World -> [N, size].
         touches: Kinds of objects whose contacts with the robot it reads.
+        bounds: Lowest and highest value.
         kind: Kind of object that the task must have; "" for none.
     """
 
@@ -44,6 +45,7 @@ class Reading(NamedTuple):
     size: Callable[[SafetyGymConfig, Scene], int]
     read: Callable[[World], Tensor]
     touches: tuple[str, ...] = ()
+    bounds: Bounds = UNBOUNDED
     kind: str = ""
 
 
@@ -80,11 +82,11 @@ def _from_start(world: World, vector: Tensor, moved: bool) -> Tensor:
 
 READINGS: list[Reading] = [
     Reading("goal_compass", ("observe_goal_comp",), lambda c, s: c.compass_shape,
-            lambda w: _compass(w, "goal"), kind="goal"),
+            lambda w: _compass(w, "goal"), bounds=(-1.0, 1.0), kind="goal"),
     Reading("box_compass", ("observe_box_comp",), lambda c, s: c.compass_shape,
-            lambda w: _compass(w, "box"), kind="box"),
+            lambda w: _compass(w, "box"), bounds=(-1.0, 1.0), kind="box"),
     Reading("goal_dist", ("observe_goal_dist",), lambda c, s: 1,
-            lambda w: torch.exp(-goal_distance(w)), kind="goal"),
+            lambda w: torch.exp(-goal_distance(w)), bounds=(0.0, 1.0), kind="goal"),
     Reading("remaining", ("observe_remaining",), lambda c, s: 1,
             lambda w: (w.step_count / w.scene.config.num_steps).unsqueeze(-1)),
     Reading("com", ("observe_com",), lambda c, s: 3, lambda w: w.com),
@@ -190,11 +192,13 @@ class Observer(NamedTuple):
         shapes: Shape of every component, in the order of the flat observation.
         columns: Columns of every component in the flat observation.
         read: World -> flat observation [N, n], float32.
+        bounds: Lowest and highest value of every component.
     """
 
     shapes: Shapes
     columns: dict[str, slice]
     read: Callable[[World], Tensor]
+    bounds: dict[str, Bounds]
 
     def split(self, flat: Tensor) -> dict[str, Tensor]:
         """Return views of a flat observation [N, n] by component, each [N, *shape]."""
@@ -210,7 +214,7 @@ def make_observer(scene: Scene, device: torch.device, others: Sequence[Block] = 
     blocks = [*sensor_blocks(scene, device), *lidar_blocks(scene, device)]
     for row in active_readings(config):
         size = row.size(config, scene)
-        blocks.append(Block({row.name: (size,)}, partial(_read, row, size)))
+        blocks.append(Block({row.name: (size,)}, partial(_read, row, size), row.bounds))
     blocks += others
     names = [name for block in blocks for name in block.shapes]
     if not names:
@@ -234,21 +238,35 @@ def make_observer(scene: Scene, device: torch.device, others: Sequence[Block] = 
         values = torch.cat([block.read(world) for block in blocks], -1)
         return values.to(torch.float32).index_select(1, permutation)
 
-    return Observer(shapes, columns, read)
+    return Observer(
+        shapes, columns, read, {n: block.bounds for block in blocks for n in block.shapes}
+    )
 
 
 def observation_spec(
     config: SafetyGymConfig, observer: Observer, num_envs: int, device: torch.device | None
 ) -> TensorSpec:
-    """Return the spec of one flat vector, or of every component in its shape."""
-    kind: dict[str, Any] = {"dtype": torch.float32, "device": device}
+    """Return the spec of one flat vector, or of every component in its shape, with bounds."""
+    bounds = {name: torch.tensor(observer.bounds[name]) for name in observer.shapes}
     if config.observation_flatten:
-        size = sum(math.prod(shape) for shape in observer.shapes.values())
-        return Unbounded(shape=(num_envs, size), **kind)
+        widths = torch.tensor([math.prod(shape) for shape in observer.shapes.values()])
+        flat = torch.stack(list(bounds.values()), 1).repeat_interleave(widths, dim=1)
+        return _within(flat, (num_envs, flat.shape[1]), device)
     components = {
-        name: Unbounded(shape=(num_envs, *shape), **kind) for name, shape in observer.shapes.items()
+        name: _within(bounds[name], (num_envs, *shape), device)
+        for name, shape in observer.shapes.items()
     }
     return Composite(components, shape=(num_envs,))
+
+
+def _within(bounds: Tensor, shape: tuple[int, ...], device: torch.device | None) -> TensorSpec:
+    """Return the spec of numbers within (low, high); an infinite bound gets a very large one."""
+    if bounds.isinf().all():
+        return Unbounded(shape=shape, dtype=torch.float32, device=device)
+    # half of the largest number, so that the width of the range is finite
+    far = torch.finfo(torch.float32).max / 2
+    low, high = (bound.clamp(-far, far).expand(shape).clone() for bound in bounds)
+    return Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
 
 
 TRACE_DECAY = 0.95

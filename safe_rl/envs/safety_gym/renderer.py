@@ -106,7 +106,7 @@ def vision_block(scene: Scene) -> Block:
             picture.copy_(torch.from_numpy(display.frame(VISION, width, height)))
         return pixels.flatten(1).to(world.robot_pos) / 255
 
-    return Block({"vision": (height, width, 3)}, read)
+    return Block({"vision": (height, width, 3)}, read, (0.0, 1.0))
 
 
 COST_RGBA, COST_RADIUS = (1.0, 0.0, 0.0, 0.5), 0.25

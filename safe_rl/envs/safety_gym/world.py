@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -66,6 +67,8 @@ class Scene:
 NO_BUTTON = -1
 
 Shapes = dict[str, tuple[int, ...]]
+Bounds = tuple[float, float]
+UNBOUNDED: Bounds = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True)
@@ -179,7 +182,9 @@ class Block(NamedTuple):
     Attributes:
         shapes: Shape of each component, in the order of the columns of `read`.
         read: World -> [N, total size].
+        bounds: Lowest and highest value of all of them.
     """
 
     shapes: Shapes
     read: Callable[[World], Tensor]
+    bounds: Bounds = UNBOUNDED
