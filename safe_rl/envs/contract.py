@@ -169,7 +169,17 @@ class ConstrainedEnv(EnvBase):
         return has_ended
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        after = super()._step_proc_data(next_tensordict_out)
+        try:
+            after = super()._step_proc_data(next_tensordict_out)
+        except (AttributeError, RuntimeError) as error:
+            written = {key: next_tensordict_out.get(key, None) for key in self.reward_keys}
+            shapes = {str(key): None if v is None else list(v.shape) for key, v in written.items()}
+            if all(shape == [*self.batch_size, 1] for shape in shapes.values()):
+                raise  # for another reason
+            raise ContractError(
+                f"{type(self).__name__}._step must write {[*self.batch_size, 1]} numbers for each "
+                f"of {', '.join(shapes)}. It wrote the shapes {shapes}."
+            ) from error
         return after.clone() if self.reuses_tensors else after
 
     def continue_from(self, steps: int) -> None:

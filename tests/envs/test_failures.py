@@ -111,6 +111,9 @@ WRONG_CONFIGS = {
     "no speed": ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
     "two starts": ({"robot_locations": [[0, 0], [1, 1]]}, "'robot_locations' has 2 .* for 1 obj"),
     "no hazards": ({"hazards_locations": [[0, 0]]}, "'hazards_locations' has 1 .* for 0 objects"),
+    "idle boundary": ({"boundary_x": 1.0}, "'boundary_x' has no effect.*'constrain_boundary'"),
+    "idle limit": ({"velocity_limit": 1.0}, "'velocity_limit' has no effect.*'constrain_vel"),
+    "idle seeds": ({"layout_seeds_first": 5}, "'layout_seeds_first' has no effect.*'layout_seeds'"),
     "no vases": ({"constrain_vases": True}, "'constrain_vases' has no effect.*'vases_num' is 0"),
 }
 

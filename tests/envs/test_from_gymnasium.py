@@ -123,11 +123,11 @@ def test_a_cost_that_comes_late_and_is_not_counted_is_told():
         env.rollout(4)
 
 
-def test_an_entry_that_a_step_writes_itself_is_refused():
-    wrong = type(
-        "Wrong", (Counter,), {"observation_space": gymnasium.spaces.Dict(reward=Box(0, 1))}
-    )
-    with pytest.raises(ConfigError, match="an entry 'reward': rename it"):
+@pytest.mark.parametrize("name", ["reward", "a.b"])  # a step writes it; it would be nested
+def test_an_entry_of_a_name_with_another_meaning_is_refused(name):
+    space = gymnasium.spaces.Dict({name: Box(0, 1)})
+    wrong = type("Wrong", (Counter,), {"observation_space": space})
+    with pytest.raises(ConfigError, match=f"an entry '{name}': rename it"):
         from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=False)
 
 

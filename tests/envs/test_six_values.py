@@ -87,6 +87,8 @@ def test_a_function_may_return_six_values_and_a_missing_package_is_said(monkeypa
     assert env.cost_keys == ["cost", "cost_right", "cost_fast"]
     step = rollout(env)["next"]
     torch.testing.assert_close(step["cost"], step["cost_right"] + step["cost_fast"])
+    with pytest.raises(ConfigError, match="third of six values: name 'cost' in cost_keys"):
+        rollout(from_gymnasium(ice, cost_keys=["cost_fast"], num_steps=12, seed=0))
     monkeypatch.setitem(sys.modules, "safety_gymnasium", None)
     with pytest.raises(ConfigError, match=r"cannot be imported.*from_gymnasium"):
         make_env(NODE)

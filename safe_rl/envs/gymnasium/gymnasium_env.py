@@ -50,6 +50,11 @@ def make_adapted(
             f"The observation has an entry '{min(taken)}': rename it, because a step writes one of "
             "this name."
         )
+    elif dotted := [key for key in (seen if isinstance(seen, spaces.Dict) else ()) if "." in key]:
+        raise ConfigError(
+            f"The observation has an entry '{dotted[0]}': rename it, because dots stand between "
+            "the names of nested entries."
+        )
     if isinstance(actions, Discrete | MultiDiscrete) and np.any(actions.start):
         choices = (
             Discrete(actions.n) if isinstance(actions, Discrete) else MultiDiscrete(actions.nvec)
@@ -92,10 +97,15 @@ class CheckedSteps(gymnasium.Wrapper):
         if not isinstance(info, dict):
             raise self._wrong("info", "a dictionary", info)
         self._check("observation", self.observation_space, observation)
+        if cost and self._cost_keys and COST not in self._cost_keys:
+            raise ConfigError(
+                f"{self.unwrapped}: a step returns its cost as the third of six values: name "
+                f"'{COST}' in cost_keys, too."
+            )
         info = {**info, **dict(zip([COST], cost, strict=False))}
         if COST_SUM in info and COST_SUM not in self._cost_keys:  # no kind of its own
             info = {COST: info.pop(COST_SUM), **info}
-        if not (cost and COST in self._cost_keys):  # the cost of six values is that of all kinds
+        if not cost:  # that of six values is of all kinds
             self._tell_uncounted(info)
         info |= {k: self._number(f"info['{k}']", info[k]) for k in self._cost_keys if k in info}
         for name, end in (("terminated", terminated), ("truncated", truncated)):

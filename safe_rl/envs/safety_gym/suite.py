@@ -126,6 +126,13 @@ EXTRAS: dict[str, Values] = _DEBUG_SUITE | {
 }
 
 
+# Keys that have no effect without another one.
+_NEEDED = {
+    **{"boundary_x": "constrain_boundary", "boundary_y": "constrain_boundary"},
+    **{"velocity_limit": "constrain_velocity", "layout_seeds_first": "layout_seeds"},
+}
+
+
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
     """Return the checked configuration of a name, a mapping of keys, or a configuration.
 
@@ -185,6 +192,9 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
         raise ConfigError("'constrain_boundary' needs 'boundary_x', 'boundary_y' or both [m].")
     if config.constrain_velocity and config.velocity_limit is None:
         raise ConfigError("'constrain_velocity' needs 'velocity_limit' [m/s].")
+    for name, needed in _NEEDED.items():
+        if getattr(config, name) and not getattr(config, needed):
+            warnings.warn(f"'{name}' has no effect: set '{needed}' too.", stacklevel=2)
     needs_cpu = config.lidar_type == "natural" or config.frameskip_binom_p < 1.0
     if config.physics == "warp" and needs_cpu:
         raise ConfigError("'lidar_type' natural and 'frameskip_binom_p' < 1 need 'physics' cpu.")
