@@ -45,7 +45,7 @@ def from_gymnasium(
     """Make a TorchRL environment of any Gymnasium environment that reports costs.
 
     Costs are entries of `info`, or the third of six values of a step, as in Safety-Gymnasium; this
-    one is called `cost`.
+    one is called `cost`, and has to be among `cost_keys` if they are given.
 
     Every observation becomes one float32 vector. Continuous actions are clipped to [-1, 1] and
     scaled to the environment's bounds. Choices (Discrete, MultiDiscrete) are integers. The N
