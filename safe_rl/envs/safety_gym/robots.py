@@ -12,7 +12,7 @@ import hashlib
 import math
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,11 +69,6 @@ class Robot:
     planar: bool
 
 
-def _refuse(path: Path, is_wrong: bool, what: str) -> None:
-    if is_wrong:
-        raise ConfigError(f"'robot_base': {path} {what}")
-
-
 def load_robot(path: Path) -> Robot:
     """Load a robot from its file, and check that it can be placed, moved and stepped.
 
@@ -92,73 +87,73 @@ def load_robot(path: Path) -> Robot:
         model = spec.copy().compile()
     except (ValueError, RuntimeError, MemoryError) as error:
         raise ConfigError(f"'robot_base': MuJoCo cannot load {path}: {error}") from error
-    _check_robot(model, path)
-    options = spec.compiler
-    _refuse(
-        path,
-        max(options.settotalmass, options.boundmass, options.boundinertia) > 0
-        or list(options.inertiagrouprange) != [0, mujoco.mjNGROUP - 1],
-        "has a compiler option (settotalmass, boundmass, boundinertia or inertiagrouprange) that "
-        "would change the masses of objects, too: give densities or masses to its geoms instead.",
-    )
+    for fault in _faults(model, spec.compiler):
+        raise ConfigError(f"'robot_base': {path} {fault}")
     for actuator, limited in zip(spec.actuators, model.actuator_ctrllimited, strict=True):
         if not limited:
             actuator.ctrlrange, actuator.ctrllimited = CONTROL_RANGE, True
-    return Robot(spec, model.nbody - 1, model.nsensor, _is_planar(model, path))
+    root = model.jnt_type[model.body_jntadr[model.body("robot").id]]
+    is_planar = root != mujoco.mjtJoint.mjJNT_FREE
+    return Robot(spec, model.nbody - 1, model.nsensor, is_planar)
 
 
-def _check_robot(model: mujoco.MjModel, path: Path) -> None:
-    for (low, high), limited in zip(
-        model.actuator_ctrlrange.tolist(), model.actuator_ctrllimited, strict=True
-    ):
+def _faults(model: mujoco.MjModel, options: mujoco.MjsCompiler) -> Iterator[str]:
+    """What makes a robot unusable; a check may rely on those before it."""
+    ranges = model.actuator_ctrlrange.tolist()
+    for (low, high), limited in zip(ranges, model.actuator_ctrllimited, strict=True):
         # MuJoCo treats a reversed range as no range.
-        _refuse(
-            path,
-            not math.isfinite(high - low) or low > high or (limited and low == high),
-            f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the lower "
-            "bound first.",
-        )
+        if not math.isfinite(high - low) or low > high or (limited and low == high):
+            yield (
+                f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
+                "lower bound first."
+            )
     names = [model.body(i).name for i in range(1, model.nbody)]
-    hint = did_you_mean("robot", names) or f" Its bodies are {names}."
-    missing = f"has no body named 'robot'.{hint} Give the root body this name."
-    _refuse(path, "robot" not in names, missing)
+    if "robot" not in names:
+        hint = did_you_mean("robot", names) or f" Its bodies are {names}."
+        yield f"has no body named 'robot'.{hint} Give the root body this name."
     body = model.body("robot")
-    parent = model.body(body.parentid[0]).name
-    inside = f"has its body 'robot' inside '{parent}': move it to the worldbody."
-    _refuse(path, body.parentid[0] != 0, inside)
-    _refuse(
-        path,
-        body.quat.tolist() != [1, 0, 0, 0],
-        "rotates its body 'robot': a reset sets the body upright with a random yaw, so give the "
-        "rotation to geoms or child bodies instead.",
-    )
-    _refuse(path, model.nu == 0, "has no actuators: add one, which an action can control.")
-    mocaps = "has mocap bodies, which a robot cannot move: make them ordinary bodies."
-    _refuse(path, model.nmocap > 0, mocaps)
+    if body.parentid[0] != 0:
+        parent = model.body(body.parentid[0]).name
+        yield f"has its body 'robot' inside '{parent}': move it to the worldbody."
+    if body.quat.tolist() != [1, 0, 0, 0]:
+        yield (
+            "rotates its body 'robot': a reset sets the body upright with a random yaw, so give "
+            "the rotation to geoms or child bodies instead."
+        )
+    if model.nu == 0:
+        yield "has no actuators: add one, which an action can control."
+    if model.nmocap > 0:
+        yield "has mocap bodies, which a robot cannot move: make them ordinary bodies."
+    every_group = [0, mujoco.mjNGROUP - 1]
+    is_changed = max(options.settotalmass, options.boundmass, options.boundinertia) > 0
+    if is_changed or list(options.inertiagrouprange) != every_group:
+        yield (
+            "has a compiler option (settotalmass, boundmass, boundinertia or inertiagrouprange) "
+            "that would change the masses of objects, too: give densities or masses to its geoms "
+            "instead."
+        )
+    yield from _faults_of_root(model, body.id)
 
 
-def _is_planar(model: mujoco.MjModel, path: Path) -> bool:
-    """Whether the root is (slide x, slide y, hinge z); otherwise it must be a free joint."""
-    body = model.body("robot").id
+def _faults_of_root(model: mujoco.MjModel, body: int) -> Iterator[str]:
+    """What is wrong unless the root is a free joint, or (slide x, slide y, hinge z)."""
     first, number = model.body_jntadr[body], model.body_jntnum[body]
     joints = slice(first, first + min(number, 3))
     types = tuple(model.jnt_type[joints])
-    _refuse(path, first > 0, "has joints before those of 'robot': put this body first.")
+    if first > 0:
+        yield "has joints before those of 'robot': put this body first."
     if types[:1] == (mujoco.mjtJoint.mjJNT_FREE,):
-        return False
-    _refuse(
-        path,
-        types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES,
-        "cannot be placed: the body 'robot' needs a free joint, or slides along x and y and a "
-        "hinge about z in this order.",
-    )
-    _refuse(
-        path,
-        any((*model.body_pos[body, :2], *model.jnt_pos[joints, :2].flat, *model.qpos0[:3])),
-        "has its planar root away from the origin: x and y of the body 'robot' and of its joints, "
-        "and their 'ref', must be 0, so that the joints are the robot's coordinates.",
-    )
-    return True
+        return
+    if types != _PLANAR_JOINTS or model.jnt_axis[joints].tolist() != _PLANAR_AXES:
+        yield (
+            "cannot be placed: the body 'robot' needs a free joint, or slides along x and y and a "
+            "hinge about z in this order."
+        )
+    if any((*model.body_pos[body, :2], *model.jnt_pos[joints, :2].flat, *model.qpos0[:3])):
+        yield (
+            "has its planar root away from the origin: x and y of the body 'robot' and of its "
+            "joints, and their 'ref', must be 0, so that the joints are the robot's coordinates."
+        )
 
 
 def own_robot(node: Mapping[str, Any]) -> Path | None:
