@@ -127,6 +127,10 @@ class Constraints(Resumable):
         Args:
             batch: Steps of the current policy, [N, T], in order of time.
             episodes: Statistics of the episodes in the batch.
+
+        Raises:
+            KeyError: If the accounting of the episodes lacks a cost that has a limit.
+            ValueError: If the batch has another shape.
         """
         if batch.ndim != 2:
             raise ValueError(

@@ -100,7 +100,13 @@ class EpisodeStatistics:
         return (self.lengths / self.steps_per_decision).ceil()
 
     def episode_costs(self, cost_keys: Sequence[NestedKey]) -> Tensor:
-        """Undiscounted costs of every finished episode, shape [E, len(cost_keys)]."""
+        """Undiscounted costs of every finished episode, shape [E, len(cost_keys)].
+
+        Raises:
+            KeyError: If the accounting was not told of a cost.
+        """
+        for key in (key for key in cost_keys if key_name(key) not in self.costs):
+            raise KeyError(f"There is no {key!r}: name it in EpisodeAccounting(…, cost_keys=[…]).")
         if not cost_keys:
             return self.returns.new_empty(self.num_episodes, 0)
         return torch.stack([self.costs[key_name(key)] for key in cost_keys], -1)

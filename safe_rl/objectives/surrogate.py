@@ -231,6 +231,8 @@ class SurrogateLoss(Checked, SharesTensors):
 
     def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
         """Objective per sample, [..., 1]: that of the reward alone."""
+        if self.multiplier is not None:
+            raise TypeError(f"{type(self).__name__} has a multiplier: derive it from WeighsCosts.")
         return reward_gain
 
 

@@ -102,6 +102,7 @@ def test_actions_are_clipped_to_the_control_range(name):
 WRONG_CONFIGS = {
     "unknown task": ({"task": "gaol"}, "'task'.*Did you mean 'goal'"),
     "unknown robot": ({"robot_base": "dogo"}, "'robot_base'.*Did you mean 'doggo'"),
+    "no key": ({"num_env": 4}, "'num_env'. Did you mean 'num_envs'"),
     "no such file": ({"robot_base": "nowhere.xml"}, "'robot_base'.*nowhere.xml"),
     "buttons missing": ({"task": "button"}, "buttons_num"),
     "unknown sensor": ({"sensors_obs": ["gyros"]}, "'sensors_obs'.*Did you mean 'gyro'"),

@@ -88,7 +88,7 @@ def test_any_configuration_can_be_made():
     for told, name, given in (
         ("Did you mean 'hazards_num'", "Safexp-Custom", {"config": {"hazard_num": 2}}),
         ("mean 'velocity_threshold'", "SafeHopperVelocity", {"config": {"velocity_treshold": 1}}),
-        ("unexpected keyword argument 'hazards_num'", "Safexp-PointGoal1", {"hazards_num": 3}),
+        (r"config=\{'hazards_num': …\}", "Safexp-PointGoal1", {"hazards_num": 3}),
         ("render_mode must be one of", "SafeHopperVelocity", {"render_mode": "ansi"}),
     ):
         with pytest.raises((ConfigError, TypeError, ValueError), match=told):

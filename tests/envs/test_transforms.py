@@ -181,6 +181,8 @@ def test_nodes_are_built_and_their_keys_named():
     late = {"_target_": "safe_rl.envs.transforms.ActionDelay", "steps": -1}
     with pytest.raises(ValueError, match=r"^transforms\.late\.steps=-1: it must be"):
         make_env("PointGoal1", transforms={"late": late})
+    with pytest.raises(TypeError, match="transforms must be a mapping"):
+        make_env("PointGoal1", transforms=["action_repeat"])
     with pytest.raises(TargetError, match=r"^transforms\.n: .* Use model\.normalise=10"):
         make_env("PointGoal1", transforms={"n": {"_target_": "transforming.normed"}})
 

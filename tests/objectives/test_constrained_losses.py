@@ -267,6 +267,14 @@ def test_a_violation_without_the_length_of_episodes_is_refused():
         loss(batch)
 
 
+def test_a_multiplier_that_would_weigh_nothing_is_refused():
+    actor, _, batch = one_state(GAIN, COST)
+    loss = PPOLoss(actor, **FREE)
+    loss.multiplier = projected(0.5)
+    with pytest.raises(TypeError, match="derive it from WeighsCosts"):
+        loss(batch)
+
+
 @pytest.mark.parametrize("name", LOSSES)
 def test_every_agent_of_a_state_has_cost_advantages_of_its_own(name):
     """As many states as agents: nothing else would tell that one were taken for the other."""

@@ -240,3 +240,10 @@ def test_batches_of_one_environment_need_their_dimension():
     batch = TensorDict(next={"cost": torch.ones(5, 1)}, batch_size=[5])
     with pytest.raises(ValueError, match=r"shape \[5\].*batch\.unsqueeze\(0\)"):
         Constraints({"cost": 1.0}).update(batch, None)
+
+
+def test_every_limited_cost_has_to_be_counted():
+    batch = TensorDict(next={"cost": torch.ones(1, 5, 1)}, batch_size=[1, 5])
+    episodes = EpisodeStatistics(torch.ones(1), {}, torch.ones(1), {})
+    with pytest.raises(KeyError, match="no 'cost': name it in EpisodeAccounting"):
+        Constraints({"cost": 1.0}).update(batch, episodes)

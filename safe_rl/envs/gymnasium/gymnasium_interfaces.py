@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
 from safe_rl.envs.families import env_node, make_env
-from safe_rl.envs.keys import COST
+from safe_rl.envs.keys import COST, ConfigError
 from safe_rl.envs.simulated import SimulatedEnv
 
 EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
@@ -53,7 +53,10 @@ class Worlds:
         camera: Any = None,
         width: int = 480,
         height: int = 360,
+        **unknown: Any,
     ) -> None:
+        for key in unknown:
+            raise ConfigError(f"Unknown argument '{key}': keys are given as config={{'{key}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         node = {**({} if name is None else env_node(name)), **(config or {})}
@@ -129,7 +132,7 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
             environment's `render`; their `width` and `height` [pixels].
 
     Raises:
-        ConfigError: For a configuration that cannot be used.
+        ConfigError: For a configuration that cannot be used, or another argument.
         ValueError: For another render mode.
 
     Examples:

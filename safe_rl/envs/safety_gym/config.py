@@ -50,7 +50,8 @@ class SafetyGymConfig(Keys):
     def __init__(self, **values: Any) -> None:
         for name in values.keys() - KEYS.keys():
             raise ConfigError(
-                f"Unknown configuration key '{name}'.{did_you_mean(name, KEYS)} "
+                f"Unknown configuration key '{name}'."
+                f"{did_you_mean(name, [*KEYS, 'num_envs', 'num_threads'])} "
                 "SafetyGymConfig lists every key with its default."
             )
         for name, row in KEYS.items():

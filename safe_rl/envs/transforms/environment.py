@@ -261,6 +261,7 @@ def transform_env(
         seed: Seed of the transforms' random draws; None draws one from torch's generator.
 
     Raises:
+        TypeError: If they are no mapping.
         ValueError: If a value is out of range, or a transform does not fit the environment.
 
     Examples:
@@ -271,6 +272,8 @@ def transform_env(
         >>> transform_env(env, {"slow": slow}, evaluating=False).cost_keys[-1]
         'cost_interventions'
     """
+    if not isinstance(transforms, Mapping):
+        raise TypeError(f"transforms must be a mapping, name -> transform, got {transforms!r}.")
     built = {name: _transform(name, given) for name, given in transforms.items()}
     for transform in built.values():
         if isinstance(transform, ConstraintTransform):
