@@ -140,7 +140,6 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     parts: list[tuple[str, str, Sequence[Block]]] = [
         ("final", "Final scores", finals),
-        ("learning", "What learning cost", list(filter(None, map(scoring.learning_table, groups)))),
         (
             "curves",
             "Learning curves",

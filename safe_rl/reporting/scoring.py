@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import inf, nan
-from statistics import mean
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval, mark_best, spread
-from safe_rl.runs.table import FINAL_EPOCHS, final_rows, final_width
+from safe_rl.runs.table import final_rows
 from safe_rl.scores import benchmark
 from safe_rl.scores.bounds import rounded_up
 
@@ -123,51 +122,6 @@ def _final_marks(
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }
-
-
-def learning_table(experiments: Sequence[Experiment]) -> Table | None:
-    """Costs during learning on one environment; None if no experiment has a limit."""
-    experiments = [e for e in experiments if e.limits]
-    if not experiments:
-        return None
-    environment = experiments[0].environment
-    keys = [k for k in cost_keys_of(experiments) if any(k in e.limits for e in experiments)]
-    records = [
-        {
-            "environment": environment,
-            "algorithm": e.algorithm,
-            "seeds": len(e.finished),
-            "hours": mean(run.hours for run in e.finished),
-            **_over_seeds([_learning_figures(run) for run in e.finished]),
-        }
-        for e in experiments
-    ]
-    columns = {
-        **{"algorithm": "{algorithm}", "seeds": "{seeds:d}"},
-        **({"cost": "{cost}"} if len(keys) > 1 else {}),
-        "regret": spread("regret", 1),
-        "epochs over": "{over:.0%}",
-        "longest streak": "{streak:.0f}",
-        "hours": "{hours:.2f}",
-    }
-    fields = {"regret": "regret_{}", "regret_std": "regret_{}_std"}
-    rows = each_cost(records, keys, **fields, over="share_over_{}", streak="streak_{}")
-    return Table(f"learning_{environment}", environment, columns, records, "", rows)
-
-
-def _learning_figures(run: Run) -> dict[str, float]:
-    figures: dict[str, float] = {}
-    if not run.column("episode_return").size:
-        return figures
-    width = final_width(run.column("steps"))
-    for key, limit in run.cost_limits.items():
-        measures = costs = run.column(f"episode_{key}")
-        if run.limits_another_measure(key):
-            violation = run.column(f"violation_{key}")
-            measures = np.where(np.isfinite(violation), limit + violation, costs)
-        spans = benchmark.joined(measures, width // FINAL_EPOCHS)
-        figures |= {f"{name}_{key}": v for name, v in benchmark.learning_cost(spans, limit).items()}
-    return figures
 
 
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}

@@ -95,7 +95,7 @@ def test_everything_is_written(report):
     # a table and a figure of every kind that these runs give reason for, and no other
     kinds = {re.match("[a-z]+", name)[0] for name in names}
     assert kinds == {
-        "report", "runs", "tables", "evaluations", "final", "learning", "curves", "fronts",
+        "report", "runs", "tables", "evaluations", "final", "curves", "fronts",
         "slate", "paper", "left",
     }  # fmt: skip
     for picture in report.glob("*.png"):

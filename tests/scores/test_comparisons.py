@@ -13,7 +13,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from safe_rl.scores.benchmark import learning_cost
 from safe_rl.scores.comparisons import (
     bootstrap,
     cvar,
@@ -114,15 +113,3 @@ def test_the_front_is_what_nobody_beats(points):
     assert {points[i] for i in front} == unbeaten
     assert len(front) == len(unbeaten)
     assert [costs[i] for i in front] == sorted(costs[i] for i in front)
-
-
-EPOCHS = st.lists(st.integers(0, 4).map(float), min_size=1, max_size=12)
-
-
-@given(costs=EPOCHS, limit=st.integers(0, 4))
-def test_figures_of_the_course_by_counting(costs, limit):
-    over = [cost > limit for cost in costs]
-    groups = [len(list(group)) for is_over, group in itertools.groupby(over) if is_over]
-    excess = sum(cost - limit for cost in costs if cost > limit)
-    expected = {"streak": max(groups, default=0), "share_over": sum(over) / len(over)}
-    assert learning_cost(costs, limit) == pytest.approx(expected | {"regret": excess / len(over)})

@@ -1,4 +1,4 @@
-"""Curves over seeds, tables as they are written, and what learning cost, of chosen numbers."""
+"""Curves over seeds, and tables as they are written, of chosen numbers."""
 
 import csv
 
@@ -8,7 +8,7 @@ from synthetic import experiments_in, write_run
 
 from safe_rl.reporting.archive import find_runs
 from safe_rl.reporting.curves import average
-from safe_rl.reporting.scoring import final_record, learning_table
+from safe_rl.reporting.scoring import final_record
 from safe_rl.reporting.tables import Table, spread
 
 
@@ -73,34 +73,6 @@ def test_tables_write_all_fields_and_show_the_chosen(tmp_path):
         {"name": "'=b", "x": "", "x_std": "", "more": "'\t7"},
         {"name": "c", "x": "3.0", "x_std": "", "more": ""},
     ]
-
-
-def test_what_learning_cost_is_counted_over_all_of_training(tmp_path):
-    costs = [45.0, 35.0, 5.0, 5.0, 5.0, 5.0, 30.0]
-    for seed in (0, 10):
-        rows = {"returns": [1.0] * 7, "rates": [0.01] * 7}
-        write_run(tmp_path, algo="cpo", seed=seed, **rows, costs=costs)
-    table = learning_table(experiments_in(tmp_path))
-    (record,) = table.records
-    assert record["regret_cost"] == pytest.approx((20 + 10 + 5) / 7)
-    assert record["share_over_cost"] == pytest.approx(3 / 7)
-    assert record["streak_cost"] == 2
-    assert record["seeds"] == 2
-    assert table.records[0]["hours"] == pytest.approx(7 * 3.6 / 3600)
-
-
-def test_epochs_of_few_steps_are_counted_together(tmp_path):
-    """200 epochs of 1000 steps: eight are a 25th of the run, which is an epoch of other runs."""
-    costs = [0.0, 48.0] * 92 + [50.0] * 8 + [0.0, 48.0] * 4
-    write_run(tmp_path, algo="cpo", returns=[1.0] * 200, costs=costs, rates=[0.01] * 200)
-    (record,) = learning_table(experiments_in(tmp_path)).records
-    assert (record["streak_cost"], record["share_over_cost"]) == (1, pytest.approx(1 / 25))
-    assert record["regret_cost"] == pytest.approx((50 - 25) / 25)
-
-
-def test_without_a_limit_learning_costs_nothing_to_speak_of(tmp_path):
-    write_run(tmp_path, limits={})
-    assert learning_table(experiments_in(tmp_path)) is None
 
 
 def test_steps_beyond_the_end_of_training_are_no_longer_training(tmp_path):
