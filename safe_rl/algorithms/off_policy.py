@@ -55,7 +55,7 @@ class OffPolicy(Resumable, Algorithm):
     def __post_init__(self) -> None:
         self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule
         self.cost_networks = [name for name in self.networks if name == "cost_critic"]
-        self._count_steps(0)
+        self._choose_exploration()
 
     @classmethod
     def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
@@ -155,7 +155,8 @@ class OffPolicy(Resumable, Algorithm):
         if self.collects:
             self.replay_buffer.extend(batch)
         steps = batch.numel() * self.steps_per_decision
-        self._count_steps(steps)
+        self.steps += steps
+        self._choose_exploration()
         needed = max(self.random_steps // self.steps_per_decision, self.replay_buffer.batch_size)
         number = self.policy_update.due(steps) if len(self.replay_buffer) >= needed else 0
         row |= {} if bias is None else constraints.column("critic_bias", bias)
@@ -171,14 +172,13 @@ class OffPolicy(Resumable, Algorithm):
         """End n-step sums: the next steps belong to new episodes."""
         self.replay_buffer.end_rows()
 
-    def _count_steps(self, steps: int) -> None:
-        self.steps += steps
+    def _choose_exploration(self) -> None:
         self.policy.is_random.fill_(self.steps < self.random_steps)
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Continue from `state_dict`."""
         super().load_state_dict(state_dict)
-        self._count_steps(0)
+        self._choose_exploration()  # it is not saved, because it follows from the steps
 
     def checkpoint_components(self) -> dict[str, Stateful]:
         """Parts with a state, by name; the replay buffer only with ``memory.keep``."""
