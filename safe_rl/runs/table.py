@@ -239,7 +239,13 @@ def final_width(steps: Iterable[float]) -> int:
 
 
 def final_rows(table: Mapping[str, Sequence[float]]) -> list[int]:
-    """The last rows of a run's table in which an episode finished, `final_width` of them."""
+    """The last rows of a run's table in which an episode finished, `final_width` of them.
+
+    Examples:
+        >>> returns = [1.0 if epoch % 5 == 4 else math.nan for epoch in range(100)]
+        >>> final_rows({"steps": range(10_000, 1_000_001, 10_000), "episode_return": returns})
+        [79, 84, 89, 94, 99]
+    """
     known = [row for row, value in enumerate(table["episode_return"]) if not math.isnan(value)]
     return known[-final_width([table["steps"][row] for row in known]) :]
 

@@ -10,6 +10,7 @@ import torch
 from point_mass import PointMass
 from torchrl.envs import DeviceCastTransform, TransformedEnv
 
+from safe_rl.envs import make_env
 from safe_rl.envs.transforms import transform_env
 from safe_rl.evaluation import video
 from safe_rl.evaluation.episodes import (
@@ -61,6 +62,22 @@ def test_every_world_contributes_its_first_episodes(number, expected):
     assert episodes.lengths.tolist() == expected
     assert episodes.returns.tolist() == expected
     assert episodes.costs["cost"].tolist() == [0.5 * length for length in expected]
+
+
+@pytest.mark.parametrize("keys", itertools.permutations(["cost", "cost_hazards", "cost_boundary"]))
+def test_costs_keep_their_names_in_any_order(keys):
+    changes = {"num_steps": 20, "hazards_size": 2.0, "constrain_boundary": True, "boundary_x": 0.001}
+    env = make_env("PointGoal1", num_envs=1, seed=0, constrain_indicator=False, **changes)
+    sums = dict.fromkeys(keys, 0.0)
+
+    def add(step):
+        for key in keys:
+            sums[key] += step["next", key].item()
+
+    policy = BehaviourPolicy(make_actor(60, 2, hidden_sizes=[4], initial_log_std=0.0))
+    episodes = collect_episodes(env, policy, 1, keys, deterministic=True, record=add)
+    assert {key: costs.item() for key, costs in episodes.costs.items()} == pytest.approx(sums)
+    assert len(set(sums.values())) == 3
 
 
 class Shaped(KnownLengths):
