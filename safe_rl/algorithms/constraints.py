@@ -80,7 +80,8 @@ class Constraints(Resumable):
         self.state_names = ("finished", "mean_length") if tracker is None else ("tracker",)
         if risk is not None:
             self.state_names = ("tracker", "risk")
-        self.schedule = tracker.schedule if tracker is not None and self.keys else ""
+        stages = [part.schedule for part in (tracker, risk) if part is not None and self.keys]
+        self.schedule = " ".join(filter(None, stages))
         self._max_length = max_length
         # mean costs and length of episodes in the last batch in which an episode finished
         self.finished = torch.full_like(self.limits, torch.nan)

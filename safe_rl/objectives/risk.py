@@ -40,9 +40,11 @@ class RiskMeasure(Checked, Resumable, ABC):
 
     Attributes:
         limits: Limits d, [k].
+        schedule: A sentence on when the measure begins to count; empty if it does from the start.
     """
 
     limits: Tensor
+    schedule: str = ""
 
     @property
     def measured_limits(self) -> Tensor:
@@ -123,6 +125,11 @@ class CVaR(RiskMeasure):
         self.limits = cost_limits.detach().cpu().float()
         self.tail, self.window = tail, window
         self.ramp_start, self.ramp_steps = ramp_start, ramp_steps
+        if end := ramp_start + ramp_steps:
+            self.schedule = (
+                f"Until step {ramp_start:,} the mean is limited; from step {end:,} on the CVaR "
+                "alone (risk.ramp_start, risk.ramp_steps)."
+            )
         self._steps_per_decision = steps_per_decision
         self._steps = 0
         self._finished = torch.empty(0, len(self.limits))

@@ -109,6 +109,7 @@ def test_the_tail_is_ramped_in():
         measure = penalised.costs.sum() + penalised.offset
         assert measure.item() == pytest.approx(4.0)  # the worst of equal episodes is the mean one
     assert weights == [0, 0, 0.5, 1, 1, 1]
+    assert risk.schedule.startswith("Until step 8 the mean is limited; from step 16 on the CVaR")
 
 
 def test_the_value_at_risk_is_that_of_the_last_episodes():
