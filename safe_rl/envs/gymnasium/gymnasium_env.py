@@ -118,8 +118,9 @@ class CheckedSteps(gymnasium.Wrapper):
         if uncounted and self._watch:
             self._watch = False
             warnings.warn(
-                f"info['{uncounted[0]}'] of step {self._step} is not counted as a cost, because it "
-                f"is not in env.cost_keys=[{','.join(self._cost_keys)}].",
+                # without the step, which differs among rows: Python shows equal warnings once
+                f"info['{uncounted[0]}'] is not counted as a cost, because it is not in "
+                f"env.cost_keys=[{','.join(self._cost_keys)}].",
                 stacklevel=2,
             )
 
