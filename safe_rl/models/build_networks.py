@@ -122,8 +122,8 @@ def observed_by(
         pictures = any(len(entry.shape) == 3 for entry in entries)
         advice = "model=cnn for the pictures" if pictures else "model=dict, an encoder for each"
         raise ValueError(
-            f"This environment observes {', '.join(map(str, entries))}, but model=mlp takes one "
-            f"vector: use {advice}, or make the environment flatten them: with "
+            f"This environment observes {', '.join(map(str, entries))}, but model=mlp and "
+            f"model=gru take one vector: use {advice}, or make the environment flatten them: with "
             "env.observation_flatten=true in Safety Gym, else with env.flatten=true."
         )
     return Observed(entries, layouts, model["input_scale"], model.get("normalise"), encoders)

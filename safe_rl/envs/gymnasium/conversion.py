@@ -60,7 +60,8 @@ def from_gymnasium(
             observation, lowest, highest), or (entry, column, lowest, highest) for a dictionary.
         num_steps: The largest number of steps of an episode; None takes it from the
             environment's `spec`.
-        seed: Environment k is seeded with this number plus k; None draws one.
+        seed: Environment k is seeded with this number plus k, by a reset before its first episode;
+            None draws one.
         device: Device of the TensorDicts.
         flatten: Whether every observation becomes one vector; False keeps pictures and
             dictionaries.

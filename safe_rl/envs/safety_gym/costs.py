@@ -72,7 +72,7 @@ class Cost(NamedTuple):
     Attributes:
         key: Its key in TensorDicts, "cost_<kind>".
         flags: Configuration keys that must all be true, or not 0, for the cost to exist.
-        magnitude: (config, world) -> [N], 0 or more.
+        magnitude: (config, world) -> [N], 0 or more; `constrain_indicator` makes it 0 or 1.
         touches: Kinds of objects whose contacts with the robot it reads.
     """
 

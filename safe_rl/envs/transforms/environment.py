@@ -127,8 +127,8 @@ def widen(spec: Composite, number: int, who: str) -> Composite:
     seen = spec["observation"]
     if len(seen.shape) != len(spec.shape) + 1:
         raise ValueError(
-            f"{who} adds columns, so the observation must be one vector, but it has the shape "
-            f"{list(seen.shape)}: let the environment make one vector of it."
+            f"{who} adds columns, so the observation must be one vector, not a dictionary or a "
+            "picture: set env.observation_flatten=true in Safety Gym, else env.flatten=true."
         )
     shape = (*seen.shape[:-1], seen.shape[-1] + number)
     spec["observation"] = Unbounded(shape, dtype=seen.dtype, device=seen.device)
