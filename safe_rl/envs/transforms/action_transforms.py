@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, OneHot, TensorSpec
 
 from safe_rl.checks import Text
+from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.transforms.environment import ConstraintTransform
 from safe_rl.naming import STEPS_TAKEN
 
@@ -44,7 +45,7 @@ class ActionFilter(ConstraintTransform):
         cost_key: Name of the cost of interventions.
 
     Raises:
-        ValueError: At a step, if the function returns another shape or type, or has a parameter
+        ConfigError: At a step, if the function returns another shape or type, or has a parameter
             `positions` and the environment has no positions.
 
     Examples:
@@ -79,7 +80,7 @@ class ActionFilter(ConstraintTransform):
         replaced = self._filter(tensordict.set("action", action.clone()), **self._asked())
         if not isinstance(replaced, Tensor) or replaced.shape != action.shape:
             got = tuple(replaced.shape) if isinstance(replaced, Tensor) else type(replaced).__name__
-            raise ValueError(
+            raise ConfigError(
                 f"The action filter must return actions of shape {tuple(action.shape)}, got {got}."
             )
         differs = (replaced != action).reshape(*tensordict.batch_size, -1)
@@ -90,9 +91,9 @@ class ActionFilter(ConstraintTransform):
         """The additional arguments of the filter, by the names of its parameters."""
         positions = self.container.get_positions() if "positions" in self._asks_for else None
         if positions is not None and positions.is_empty():
-            raise ValueError(
+            raise ConfigError(
                 "The action filter has a parameter 'positions', but this environment has no "
-                "positions (get_positions)."
+                "positions (get_positions): use the observation and its 'layout'."
             )
         known = {"positions": positions, "layout": self.container.observation_layout}
         return {name: known[name] for name in self._asks_for}
