@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -71,8 +72,7 @@ def compose_run(
     places = [Path(folder).expanduser().absolute() for folder in folders]
     for missing in (place for place in places if not place.is_dir()):
         raise ValueError(f"config_dir={missing}: there is no such folder.")
-    paths = [f"file://{place}" for place in places]
-    words = [*overrides_of({"hydra.searchpath": paths} if paths else {}), *words]
+    words = [*_searched(places), *words]
     try:
         config = _compose(words, name)
     except COMPOSITION_ERRORS as error:
@@ -80,6 +80,12 @@ def compose_run(
         raise ValueError(explain(error, given)) from error
     name_choices(config, config.hydra)
     return config
+
+
+def _searched(folders: Iterable[str | Path]) -> list[str]:
+    """The override that does what ``--config-dir`` does for a command, if there are folders."""
+    paths = [f"file://{Path(folder).absolute()}" for folder in folders]
+    return [*overrides_of({"hydra.searchpath": paths} if paths else {})]
 
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
@@ -239,8 +245,10 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     wrong = ("-", f"{given}=", f"{key}=")
     settings = (word for word in words if "=" in word)
     others = [word for word in settings if not word.lstrip("+~").startswith(wrong)]
+    folders = [word for flag, word in pairwise(words) if flag in ("--config-dir", "-cd")]
+    folders += [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
     try:
-        config = _compose(others, name)
+        config = _compose([*_searched(folders), *others], name)
     except (HydraException, OmegaConfBaseException):
         return unknown_key(key, [])
     section = key.partition(".")[0]

@@ -153,6 +153,8 @@ def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
         choice = [] if wrong.startswith("algo=") else ["algo=mine"]
         with pytest.raises(ValueError, match=meant):
             composed(folder, *choice, wrong)
+    given = ["--config-dir", str(tmp_path)] if flag.startswith("-") else [folder]
+    assert "Did you mean 'env.hazards_num'" in status_of("env=Nearby", "env.hazard_num=3", *given)
 
 
 @pytest.mark.parametrize(
