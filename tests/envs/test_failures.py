@@ -115,6 +115,7 @@ WRONG_CONFIGS = {
     "idle boundary": ({"boundary_x": 1.0}, "'boundary_x' has no effect.*'constrain_boundary'"),
     "idle limit": ({"velocity_limit": 1.0}, "'velocity_limit' has no effect.*'constrain_vel"),
     "idle seeds": ({"layout_seeds_first": 5}, "'layout_seeds_first' has no effect.*'layout_seeds'"),
+    "idle weight": ({"hazards_cost": 5.0}, "'hazards_cost' has no effect.*'constrain_indicator'"),
     "no vases": ({"constrain_vases": True}, "'constrain_vases' has no effect.*'vases_num' is 0"),
 }
 

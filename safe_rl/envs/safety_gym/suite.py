@@ -131,6 +131,11 @@ _NEEDED = {
     **{"boundary_x": "constrain_boundary", "boundary_y": "constrain_boundary"},
     **{"velocity_limit": "constrain_velocity", "layout_seeds_first": "layout_seeds"},
 }
+# Keys that change the sizes of costs, and nothing else.
+_WEIGHTS = (
+    *("hazards_cost", "pillars_cost", "buttons_cost"),
+    *("vases_contact_cost", "gremlins_contact_cost"),
+)
 
 
 def resolve(env: str | Mapping[str, Any] | SafetyGymConfig) -> SafetyGymConfig:
@@ -195,6 +200,10 @@ def check(config: SafetyGymConfig) -> SafetyGymConfig:
     for name, needed in _NEEDED.items():
         if getattr(config, name) and not getattr(config, needed):
             warnings.warn(f"'{name}' has no effect: set '{needed}' too.", stacklevel=2)
+    for name in _WEIGHTS if config.constrain_indicator else ():
+        if getattr(config, name) not in (0, 1):
+            message = f"'{name}' has no effect: set 'constrain_indicator' to false."
+            warnings.warn(message, stacklevel=2)
     needs_cpu = config.lidar_type == "natural" or config.frameskip_binom_p < 1.0
     if config.physics == "warp" and needs_cpu:
         raise ConfigError("'lidar_type' natural and 'frameskip_binom_p' < 1 need 'physics' cpu.")
