@@ -250,7 +250,9 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     try:
         config = _compose([*_searched(folders), *others], name)
     except (HydraException, OmegaConfBaseException):
-        return unknown_key(key, [])
+        is_sweep = {"-m", "--multirun"} & {*words}
+        hint = f" If only swept algorithms have it, write '++{key}=…'." if is_sweep else ""
+        return unknown_key(key, []) + hint
     section = key.partition(".")[0]
     if OmegaConf.is_missing(config, section):
         return _absent(section)

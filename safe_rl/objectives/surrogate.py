@@ -218,7 +218,8 @@ class SurrogateLoss(Checked, SharesTensors):
     def _cost_advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Cost advantages, [..., k]."""
         key = self.tensor_keys.cost_advantage
-        advantage = require(tensordict, key, "CostGAE writes it.")
+        hint = "" if self.has_costs else f"{type(self).__name__} needs has_costs = True to get it; "
+        advantage = require(tensordict, key, f"{hint}CostGAE writes it.")
         num_costs = advantage.shape[-1] if self.multiplier is None else self.multiplier.num_costs
         # with several agents in a state, each has its own cost advantage and log-probability
         samples = tensordict[self.tensor_keys.sample_log_prob]
@@ -232,7 +233,10 @@ class SurrogateLoss(Checked, SharesTensors):
     def _lagrangian(self, tensordict: TensorDictBase, reward_gain: Tensor, ratio: Tensor) -> Tensor:
         """Objective per sample, [..., 1]: that of the reward alone."""
         if self.multiplier is not None:
-            raise TypeError(f"{type(self).__name__} has a multiplier: derive it from WeighsCosts.")
+            raise TypeError(
+                f"{type(self).__name__} has a multiplier, which this class does not use: derive it "
+                "from PPOLagrangianLoss, or from safe_rl.objectives.surrogate.WeighsCosts."
+            )
         return reward_gain
 
 

@@ -82,6 +82,10 @@ def test_wrong_words_name_the_right_ones(argument):
     assert len(str(caught.value).splitlines()) == 1
 
 
+def test_a_key_that_only_swept_algorithms_have_is_told_how_it_is_written():
+    assert "write '++loss.kappa=…'" in status_of("-m", "algo=p3o,appo", "loss.kappa=5")
+
+
 def test_an_algorithm_has_the_name_of_its_choice():
     """A merged mapping once trained PPO-Lagrangian as CPO."""
     (config,) = composed("algo={name: cpo}")

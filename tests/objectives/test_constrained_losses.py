@@ -271,8 +271,19 @@ def test_a_multiplier_that_would_weigh_nothing_is_refused():
     actor, _, batch = one_state(GAIN, COST)
     loss = PPOLoss(actor, **FREE)
     loss.multiplier = projected(0.5)
-    with pytest.raises(TypeError, match="derive it from WeighsCosts"):
+    with pytest.raises(TypeError, match=r"derive it from PPOLagrangianLoss, or .*WeighsCosts"):
         loss(batch)
+
+
+def test_a_loss_that_reads_costs_without_saying_so_is_told_to():
+    class Careless(PPOLoss):
+        def _surrogates(self, tensordict, log_weight):
+            return {"loss_objective": self._cost_advantage(tensordict)}
+
+    actor, _, batch = one_state(GAIN, COST)
+    loss = Careless(actor, **FREE)
+    with pytest.raises(KeyError, match="Careless needs has_costs = True"):
+        loss(batch.select(*loss.in_keys))  # as an update does
 
 
 @pytest.mark.parametrize("name", LOSSES)
