@@ -53,7 +53,7 @@ class ReportOptions(CheckedOptions):
 
     out: str | None = option(None, "folder of the report; null: RUNS_DIR/report")
     seeds: PositiveInt = option(len(SEEDS), "finished runs per environment that a slate needs")
-    algos: str | None = option(None, "algorithms to report, such as cpo,ppo_lagrangian; null: all")
+    algos: str | None = option(None, "algorithms, also of baselines, such as cpo,ppo; null: all")
     baselines: str | None = option(
         None, "other runs to put beside these: archives or folders, such as results/held_out"
     )
@@ -123,13 +123,13 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
         ValueError: If one of the algorithms has no run.
     """
     runs, skipped = find_runs(root, unfinished=options.unfinished)
+    runs = [*runs, *_baselines(listed(options.baselines), {run.environment for run in runs})]
     algorithms, width = listed(options.algos), options.width
     known = sorted({run.algorithm for run in runs})
     for name in algorithms:
         if name not in known:
             raise ValueError(f"algos={name}: there are runs of {', '.join(map(clean, known))}.")
     chosen = [run for run in runs if run.algorithm in (algorithms or known)]
-    chosen += _baselines(listed(options.baselines), {run.environment for run in chosen})
     experiments, repeated = group_runs(chosen, suite, options.labels)
     skipped |= repeated
     styles = figures.algorithm_styles(experiments)

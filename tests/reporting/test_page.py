@@ -261,6 +261,8 @@ def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_ar
     assert table.to_dict() == {"PPO": 1.0, "Mine, first": 1.0, "Mine, first (held_out)": 5.0}
     assert not (out / "final_CarGoal1.csv").exists()
     assert list(read_archive(kept)) == ["PointGoal1/cpo/seed0"]
+    assert main([str(mine), *words[:2], "algos=ppo"]) == 0  # only the baselines have it
+    assert list(pandas.read_csv(out / "final_PointGoal1.csv").algorithm) == ["PPO"]
 
 
 def test_pictures_and_tables_for_papers(tmp_path):
