@@ -205,6 +205,8 @@ def _unknown_choice(error: MissingConfigException) -> str:
         known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
     file = re.match(r"In '(?!config)([^']+)'", str(error))
     place = f"{file[1]}.yaml: " if file else ""
+    if file and not known:
+        return f"{place}there is no {group}. In 'defaults' write /{Path(group).name}: {name}."
     if name in known:
         return f"{place}there is no '{name}': --config-path replaces conf/, --config-dir adds."
     all_of_them = f"There are {', '.join(known)}"

@@ -255,6 +255,11 @@ def _check_parts(config: DictConfig) -> None:
         )
     # an algorithm of the user's own may do without some of them
     is_of_package = str(config.algo.get("_target_")).startswith("safe_rl.")
+    if is_of_package and (misplaced := General.__annotations__.keys() & config.algo.keys()):
+        raise SettingError(
+            f"algo.{min(misplaced)}: below 'algo' it has no effect. An algorithm's file begins "
+            "with the line '# @package _global_'."
+        )
     for name in _NEEDED if is_of_package else ():
         part = config.get(name, "absent")
         if part is None or (OmegaConf.is_dict(part) and part.get("_target_", "") is None):

@@ -82,6 +82,21 @@ def test_wrong_words_name_the_right_ones(argument):
     assert len(str(caught.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        # it once trained P3O under the name of the user's loss
+        ("defaults: [p3o]\nloss: {kappa: 1}\n", r"^algo\.loss: .* '# @package _global_'\.$"),
+        ("# @package _global_\ndefaults: [p3o, lagrangian: pi]\n", r"write /lagrangian: pi\.$"),
+    ],
+)
+def test_a_file_that_would_not_change_an_algorithm_is_refused(tmp_path, text, message):
+    (tmp_path / "algo").mkdir()
+    (tmp_path / "algo" / "mine.yaml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        composed("algo=mine", f"--config-dir={tmp_path}")
+
+
 def test_a_key_that_only_swept_algorithms_have_is_told_how_it_is_written():
     assert "write '++loss.kappa=…'" in status_of("-m", "algo=p3o,appo", "loss.kappa=5")
 
