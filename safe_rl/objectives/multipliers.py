@@ -66,7 +66,8 @@ class Multiplier(Checked, nn.Module, ABC):
     unless λ is the buffer `penalty`.
 
     Args:
-        cost_limits: Mapping from cost key to limit, or limits alone; see `parse_cost_limits`.
+        cost_limits: Mapping from cost key to limit, or limits alone; see `parse_cost_limits`. λ
+            follows the targets that `update` gets, which may be others.
 
     Attributes:
         cost_keys: One key per cost, in the order of every [k] tensor.
