@@ -32,13 +32,7 @@ _MOST_BYTES = 200_000_000  # of either file when it is unpacked
 
 
 class Run(folders.Run):
-    """A run of a report.
-
-    Args:
-        directory: Its folder; for an archived run, its name below the archive.
-        settings: Its configuration, resolved.
-        table: Columns of its table; a row per epoch, NaN where there is no number.
-        notes: ``overrides``, ``certificate``, ``code`` and so on, as in its files.
+    """A run of a report; ``notes`` are ``overrides``, ``certificate`` … as in its files.
 
     Attributes:
         takes_part: Whether it counts as finished before it has reached its end.
@@ -123,14 +117,9 @@ class Run(folders.Run):
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
-    """Find every run below a folder, in folders of their own and in archives.
+    """Runs below a folder that have finished an epoch, also of archives; and what is left out.
 
-    Args:
-        root: The folder.
-        unfinished: Whether runs count as finished that have not reached their configured end.
-
-    Returns:
-        Runs that have finished an epoch, and folder or file -> the reason why it is left out.
+    The latter is folder or file -> reason. With ``unfinished`` all runs count as finished.
 
     Raises:
         FileNotFoundError: If there is no such folder, or no run in it.
@@ -231,16 +220,17 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
                 f"archive={archive}: its run {name} has {longest:,.0f} steps, that in {root} only "
                 f"{steps:,}, which would replace them. Give another folder for these runs."
             )
-    write_archive(kept | names, archive)
+    _write_archive(dict(sorted((kept | names).items())), archive)
 
 
-def write_archive(runs: Mapping[str, Run], folder: Path) -> None:
+def _write_archive(runs: Mapping[str, Run], folder: Path) -> None:
     """Write runs, by name, as an archive; equal runs give equal bytes."""
     pandas = import_extra("pandas", "report")
-    runs = dict(sorted(runs.items()))
     folder.mkdir(parents=True, exist_ok=True)
-    entries = {name: {"config": run.settings, **run.notes} for name, run in runs.items()}
-    lines = [f"{json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
+    lines = [
+        f"{json.dumps(name)}: {json.dumps({'config': run.settings, **run.notes})}"
+        for name, run in runs.items()
+    ]
     tables = {name: pandas.DataFrame(run.table) for name, run in runs.items()}
     rows = pandas.concat(tables, names=["run", "row"]).reset_index("run").convert_dtypes()
     table = rows.to_csv(index=False, lineterminator="\n")

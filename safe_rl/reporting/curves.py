@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from textwrap import fill
 from typing import Any, NamedTuple
@@ -89,15 +89,11 @@ def draw_learning_curves(
     panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
     several = len({name for name, _ in groups}) < len(groups)
     for (environment, steps, key), axes in zip(rows, panels, strict=True):
-        shown = groups[environment, steps]
-        for experiment in shown:
-            draw_experiment(experiment, key, axes, styles[experiment.label])
+        _draw_panels(groups[environment, steps], key, axes, styles)
         words = [fill(environment.replace(" (", "\n("), 24, replace_whitespace=False)]
         words += [f"{short_number(steps)} steps"] if several else []
         words += [] if key == "cost" else [clean(key, 40)]
         axes[0].set_ylabel(literal("\n".join(words)), fontweight="bold")
-        for panel, height in limits_of(shown, key):
-            axes[panel].axhline(height, **LIMIT_STYLE)
         set_axes(axes)
     for axis, title in zip(panels[0], _TITLES, strict=True):
         axis.set_title(title, fontweight="bold")
@@ -143,10 +139,7 @@ def draw_benchmark(
             (e for e in experiments if e.benchmark == name),
             key=lambda e: [*ALGORITHMS].index(e.base),
         )
-        for experiment in shown:
-            draw_experiment(experiment, "cost", axes, styles[experiment.label])
-        for panel, height in limits_of(shown, "cost"):
-            axes[panel].axhline(height, **LIMIT_STYLE)
+        _draw_panels(shown, "cost", axes, styles)
         axes[0].set_title(f"{name}\n{_coverage(shown)}", fontsize=8)
         axes[2].set_xlabel("environment steps", fontsize=8)
         for axis in axes if not shown else ():
@@ -167,15 +160,6 @@ def _coverage(experiments: Sequence[Experiment]) -> str:
     unit = "seed" if seeds == [1] else "seeds"
     algorithms = f"{len(experiments)} of {len(ALGORITHMS)} algorithms"
     return algorithms + (f", {several} {unit}" if seeds else "")
-
-
-def limits_of(experiments: Iterable[Experiment], key: str) -> list[tuple[int, float]]:
-    """Index of a panel, and height of a limit in it: 1 and d; 2, the cost rate, and d / T_ep."""
-    pairs = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
-    return [
-        *((1, limit) for limit, _ in pairs),
-        *((2, limit / length) for limit, length in pairs if length is not None),
-    ]
 
 
 def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
@@ -207,11 +191,21 @@ def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
     ]
 
 
-def draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
-    """Draw return, episode cost and cost rate of an experiment into a panel each.
+def _draw_panels(
+    experiments: Sequence[Experiment], key: str, axes: Sequence[Axes], styles: Mapping[str, Style]
+) -> None:
+    """Draw return, episode cost and cost rate into a panel each, with the limits d and d / T_ep."""
+    for experiment in experiments:
+        _draw_experiment(experiment, key, axes, styles[experiment.label])
+    limits = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
+    for limit, length in limits:
+        axes[1].axhline(limit, **LIMIT_STYLE)
+        if length is not None:
+            axes[2].axhline(limit / length, **LIMIT_STYLE)
 
-    Finished runs are drawn as a mean and its interval, each unfinished run as a line.
-    """
+
+def _draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
+    """Draw finished runs as a mean and its interval, each unfinished run as a line."""
     name = literal(experiment.label)
     looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]
     unfinished = [[run] for run in experiment.runs if not run.is_finished]

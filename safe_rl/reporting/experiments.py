@@ -116,17 +116,12 @@ def cost_keys_of(experiments: Sequence[Experiment]) -> list[str]:
 
 
 def group_runs(
-    runs: Sequence[Run], suite: Suite, labels: Mapping[str, str] | None = None
+    runs: Sequence[Run], suite: Suite, labels: Mapping[str, str] = {}
 ) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
-    Args:
-        runs: The runs.
-        suite: The benchmark.
-        labels: Name of an algorithm in ``conf/algo`` -> its name in tables and pictures.
-
-    Returns:
-        Experiments, and folder -> the reason why a run is left out.
+    ``labels``: name of an algorithm in ``conf/algo`` -> its name in tables and pictures. The second
+    result is folder -> the reason why a run is left out.
     """
     environments = _environment_names(runs, suite)
     settings = _settings_of_names(runs, environments)
@@ -135,7 +130,7 @@ def group_runs(
     # of several runs with one seed, the longest is kept; among equal ones the last by name
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         environment = environments[run.directory]
-        title = clean((labels or {}).get(run.algorithm) or title_of(run.algorithm), 80)
+        title = clean(labels.get(run.algorithm) or title_of(run.algorithm), 80)
         benchmark = suite.name_of(run.settings["env"])
         experiment = Experiment(environment, title, settings[run.directory], benchmark, (run,))
         cell = cells[environment, experiment.algorithm]

@@ -38,20 +38,12 @@ _LEGEND, _LONGEST_LABEL = 140, 60  # widths of a legend and of a line in it [let
 
 
 class Style(NamedTuple):
-    """How an experiment is drawn; experiments with one algorithm share colour and marker.
-
-    Attributes:
-        colour: Colour of lines and markers.
-        marker: Matplotlib's name of the marker.
-        line: Style of the line; variants of an algorithm have different ones.
-        is_filled: Whether markers are filled: those of an algorithm's first variant, and of
-            variants that differ from it only in limits.
-    """
+    """How an experiment is drawn; experiments with one algorithm share colour and marker."""
 
     colour: str
     marker: str
-    line: Any
-    is_filled: bool
+    line: Any  # variants of an algorithm have different ones
+    is_filled: bool  # the first variant's markers, and of those that differ from it only in limits
 
     @property
     def point(self) -> dict[str, Any]:

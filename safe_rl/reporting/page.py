@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import datetime
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -135,35 +135,24 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     styles = figures.algorithm_styles(experiments)
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [scoring.final_table(group) for group in groups]
+    curves = [*benchmark_figures(experiments, width), *_curves(experiments, styles, width)]
     complete = slates.complete_slates(experiments, options.seeds)
+    normalised = [*starmap(slates.slate_table, complete), slates.paper_table(experiments)]
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
-    parts: list[tuple[str, str, Sequence[Block]]] = [
-        ("final", "Final scores", finals),
-        (
-            "curves",
-            "Learning curves",
-            [
-                *benchmark_figures(experiments, width),
-                *_curves(experiments, styles, width),
-            ],
-        ),
-        ("fronts", "Return against cost", _fronts(groups, finals, styles, width)),
-        (
-            "normalised",
-            "Normalised scores",
-            [*starmap(slates.slate_table, complete), slates.paper_table(experiments)],
-        ),
-        ("certificates", "Certificates", [scoring.certificate_table(experiments)]),
-        ("evaluations", "Evaluations", [scoring.evaluation_table(experiments)]),
-        ("runs", "Runs", [scoring.run_table(experiments), left_out]),
+    sections = [
+        Section("final", "Final scores", finals),
+        Section("curves", "Learning curves", curves),
+        Section("fronts", "Return against cost", _fronts(groups, finals, styles, width)),
+        Section("normalised", "Normalised scores", normalised),
+        Section("certificates", "Certificates", [scoring.certificate_table(experiments)]),
+        Section("evaluations", "Evaluations", [scoring.evaluation_table(experiments)]),
+        Section("runs", "Runs", [scoring.run_table(experiments), left_out]),
     ]
     # tables without rows are left out
-    sections = [
-        Section(name, title, [b for b in blocks if not isinstance(b, Table) or b.records])
-        for name, title, blocks in parts
-    ]
-    return Report(experiments, [s for s in sections if s.blocks], skipped)
+    shown = [(s, [b for b in s.blocks if not isinstance(b, Table) or b.records]) for s in sections]
+    sections = [section._replace(blocks=blocks) for section, blocks in shown if blocks]
+    return Report(experiments, sections, skipped)
 
 
 def _baselines(places: Sequence[str], environments: Collection[str]) -> list[Run]:
@@ -258,7 +247,6 @@ def write_report(report: Report, out: Path, title: str, options: ReportOptions) 
     jinja2 = import_extra("jinja2", "report")
     tables = [b for s in report.sections for b in s.blocks if isinstance(b, Table)]
     out.mkdir(parents=True, exist_ok=True)
-    place = _places(out)
     replace_text(out / "tables.tex", "\n".join(table.latex() for table in tables))
     curves = Table("curves", "Learning curves", {}, curve_rows(report.experiments))
     curves.write_csv(out / "curves.csv")
@@ -270,40 +258,31 @@ def write_report(report: Report, out: Path, title: str, options: ReportOptions) 
         undefined=jinja2.StrictUndefined,
     )
     environment.filters["symbols"] = _symbols
+    names: set[str] = set()
     text = environment.get_template("report.html.jinja").render(
         title=clean(title),
         date=datetime.datetime.now().astimezone().strftime("%d %B %Y, %H:%M"),
         facts=_facts(report),
         texts=_TEXTS,
-        sections=[(s, [(b, _write(b, place, options)) for b in s.blocks]) for s in report.sections],
+        sections=[
+            (s, [(b, _write(b, out, names, options)) for b in s.blocks]) for s in report.sections
+        ],
     )
     replace_text(out / "report.html", text)
     return out / "report.html"
 
 
-def _places(out: Path) -> Callable[[str], Path]:
-    """A function that turns a name into the path of a file without suffix, never twice the same."""
-    taken: set[str] = set()
-
-    def place(name: str) -> Path:
-        stem = re.sub(r"\W+", "_", name).strip("_")[:100]
-        free = next(n for i in count() if (n := f"{stem}{i or ''}") not in taken)
-        taken.add(free)
-        return out / free
-
-    return place
-
-
-def _write(block: Block, place: Callable[[str], Path], options: ReportOptions) -> str:
-    """Write the files of a block; return the PNG of a picture in base64, for the page."""
+def _write(block: Block, out: Path, names: set[str], options: ReportOptions) -> str:
+    """Write the files of a block under a new name; return a picture's PNG in base64, or ""."""
+    stem = re.sub(r"\W+", "_", block.name).strip("_")[:100]
+    name = next(n for i in count() if (n := f"{stem}{i or ''}") not in names)
+    names.add(name)
     if isinstance(block, Table):
-        block.write_csv(place(block.name).with_suffix(".csv"))
-    if not isinstance(block, Drawing):
+        block.write_csv(out / f"{name}.csv")
         return ""
-    path, formats = place(block.name), listed(options.formats)
-    for form in {*formats, "png"}:  # the page needs PNG
-        save_figure(block.figure, path.with_suffix(f".{form}"))
-    return base64.b64encode(path.with_suffix(".png").read_bytes()).decode()
+    for form in {*listed(options.formats), "png"}:  # the page needs PNG
+        save_figure(block.figure, out / f"{name}.{form}")
+    return base64.b64encode((out / f"{name}.png").read_bytes()).decode()
 
 
 def _facts(report: Report) -> dict[str, str]:

@@ -108,17 +108,14 @@ def _final_marks(
     Only experiments with equal ``rivals`` (lengths of training, limits) are compared.
     """
 
-    def best(name: str, of: Callable[..., float]) -> Callable[[Record], str]:
-        mark = mark_best(records, name, of, lambda r: r["satisfies"], rivals)
-        # single costs are not ranked
-        return lambda row: mark(row) if name == "episode_return" or row.get("key") == "cost" else ""
-
     def over(row: Record) -> str:
         return "bad" if row.get("excess", 0.0) > 0 else ""
 
+    rates = mark_best(records, "cost_rate", min, lambda r: r["satisfies"], rivals)
     return {
-        "$J_r$": best("episode_return", max),
-        r"$\rho_c$": best("cost_rate", min),
+        "$J_r$": mark_best(records, "episode_return", max, lambda r: r["satisfies"], rivals),
+        # single costs are not ranked
+        r"$\rho_c$": lambda row: rates(row) if row.get("key") == "cost" else "",
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }

@@ -104,14 +104,13 @@ def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
         note += f" Paper: after {' (Doggo: '.join(f'{n:,}' for n in after)} steps"
         note += ")." if len(after) > 1 else "."
 
-    def best(name: str, of: Any) -> Any:
-        is_able = lambda r: r["violation"] <= benchmark.NOISE_OF_ZERO  # noqa: E731
-        return mark_best(records, name, of, is_able, rivals)
+    def is_able(record: Record) -> bool:
+        return record["violation"] <= benchmark.NOISE_OF_ZERO
 
     marks = {
-        _SYMBOLS["episode_return"]: best("episode_return", max),
+        _SYMBOLS["episode_return"]: mark_best(records, "episode_return", max, is_able, rivals),
         _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > benchmark.NOISE_OF_ZERO else "",
-        _SYMBOLS["cost_rate"]: best("cost_rate", min),
+        _SYMBOLS["cost_rate"]: mark_best(records, "cost_rate", min, is_able, rivals),
     }
     title = {"shared": "What all algorithms were trained on"}.get(slate, slate)
     return Table(f"slate_{slate}", title, columns, records, note, marks=marks)
