@@ -48,13 +48,9 @@ def match_columns(
     if not isinstance(columns, list) or not all(isinstance(name, str) for name in columns):
         raise ValueError("their columns are not a list of names")
     if sorted(columns) != sorted(wanted):
-        others, missing = (
-            ", ".join(dict.fromkeys(name.partition("[")[0] for name in names)) or "nothing"
-            for names in (
-                [name for name in columns if name not in wanted],
-                [name for name in wanted if name not in columns],
-            )
-        )
+        both = (set(columns) - set(wanted), set(wanted) - set(columns))
+        kinds = ({name.partition("[")[0] for name in names} for names in both)
+        others, missing = (", ".join(sorted(names)) or "nothing" for names in kinds)
         raise ValueError(printable(f"they have {others}, where this environment has {missing}"))
     for key, value in of_env.items():
         if isinstance(sensors, dict) and sensors.get(key, value) != value:

@@ -53,12 +53,11 @@ class Certificate:
                 f"({missing}; {episodes})."
             )
             return line + self._episodes_needed_text()
+        head = f"Certified {level} {actions}"
         if set(verdict.by_construction) == set(verdict.bounds):
             head = f"Limit kept {actions}"
         elif len(verdict.bounds) > 1:
-            head = f"Certified {level} {actions}, all bounds together"
-        else:
-            head = f"Certified {level} {actions}"
+            head += ", all bounds together"
         lines = [self._bound_text(name) for name in verdict.bounds]
         after = f"{checkpoint_steps(self.checkpoint):,} steps, return {self.episode_return:.2f}"
         if len(lines) == 1:
@@ -74,9 +73,8 @@ class Certificate:
 
     def _bound_text(self, name: str) -> str:
         bound, limit = self.verdict.bounds[name]
-        if name in self.verdict.by_construction:
-            return f"{name} ≤ {rounded_up(bound):.3g} by construction, limit {limit:g}"
-        return f"{name} ≤ {rounded_up(bound):.3g}, limit {limit:g}"
+        why = " by construction" if name in self.verdict.by_construction else ""
+        return f"{name} ≤ {rounded_up(bound):.3g}{why}, limit {limit:g}"
 
     def _episodes_needed_text(self) -> str:
         if self.fewest <= self.options.episodes:
@@ -90,13 +88,13 @@ class Certificate:
 
     def _not_covered_text(self) -> str:
         sentences = []
-        capped = [name for name in self.verdict.bounds if name.startswith("beyond_")]
-        for name in capped:
-            cap, _, key = name.removeprefix("beyond_").partition("_")
-            sentences.append(
-                f"The mean of {key} is that of costs up to {cap}; {name} is the share of episodes "
-                "that cost more."
-            )
+        for name in self.verdict.bounds:
+            if name.startswith("beyond_"):
+                cap, _, key = name.removeprefix("beyond_").partition("_")
+                sentences.append(
+                    f"The mean of {key} is that of costs up to {cap}; {name} is the share of "
+                    "episodes that cost more."
+                )
         if not sentences:
             most = ", ".join(f"{value:,.4g}" for value in self.verdict.highest.values())
             sentences.append(f"The bound includes rare episodes that cost up to {most}.")

@@ -52,16 +52,9 @@ def certify_run(
     changes: Mapping[str, Any] | None = None,
     deterministic: bool = False,
 ) -> Certificate | None:
-    """Certify the best checkpoint of a run that keeps its limits; no other process may write it.
+    """`certify` with some keys of the section ``certificate`` changed, under the run's lock.
 
-    Args:
-        directory: Folder of the run; a policy of the package is copied into the working directory.
-        num_threads: Threads that step environments; 0 is one per core.
-        changes: Keys of the section ``certificate`` to change.
-        deterministic: Whether the policy acts with its mean actions.
-
-    Returns:
-        The certificate; None if the run has no limits or no checkpoints.
+    A policy of the package is copied into the working directory.
 
     Raises:
         RunInUseError: If another process writes into the folder.
@@ -187,27 +180,21 @@ def _ranked(
         rounds = [int(share * options.ranking) for share in _ROUNDS]
         rounds[-1] = options.ranking - sum(rounds[:-1])
     episodes_of: list[list[Episodes]] = [[] for _ in evaluations]
-    left, given_up = list(range(len(evaluations))), list[int]()
+    order, left = list(range(len(evaluations))), len(evaluations)
     for part, number in enumerate(rounds):
-        seed = _RANKING + part * _NEXT_BATCH
-        for group in [left] if together else [[candidate] for candidate in left]:
-            group_evaluations = [evaluations[candidate] for candidate in group]
-            highest, episodes = next(_run(group_evaluations, seed, number, progress))
+        seed, tried = _RANKING + part * _NEXT_BATCH, order[:left]
+        for group in [tried] if together else [[candidate] for candidate in tried]:
+            highest, episodes = next(_run([evaluations[c] for c in group], seed, number, progress))
             for candidate, batch in zip(group, episodes, strict=True):
                 episodes_of[candidate].append(batch)
         claim = replace(claim, highest=highest)
         costs = [_costs(*parts) for parts in episodes_of]
         claims = [claim.with_thresholds(of_candidate) for of_candidate in costs]
         returns = [torch.cat([part.returns for part in parts]).numpy() for parts in episodes_of]
-        order = rank(
-            [returns[candidate] for candidate in left],
-            [costs[candidate] for candidate in left],
-            [claims[candidate] for candidate in left],
-        )
-        left = [left[place] for place in order]
-        kept = max(options.tests, -(-len(left) // 2)) if part + 1 < len(rounds) else len(left)
-        left, given_up = left[:kept], left[kept:] + given_up
-    return left + given_up, claims
+        places = rank(*([values[c] for c in tried] for values in (returns, costs, claims)))
+        order[:left] = [tried[place] for place in places]
+        left = max(options.tests, -(-left // 2))
+    return order, claims
 
 
 def _costs(*parts: Episodes) -> dict[str, np.ndarray]:
@@ -252,9 +239,8 @@ def _run(
             if part == 0 or not is_fixed:
                 stack.close()
                 seed = run_seed + seed_offset + part * _NEXT_BATCH
-                of_layout = run_seed if is_fixed else seed
-                changed = replace(evaluation, options=replace(evaluation.options, seed=of_layout))
-                env = stack.enter_context(closing(changed.make(worlds * together)))
+                env = evaluation.make(worlds * together, run_seed if is_fixed else seed)
+                stack.enter_context(closing(env))
                 if is_fixed:
                     _seed_without_layout(env, seed)
                 policy = _side_by_side([each.policy(env) for each in evaluations])
@@ -265,13 +251,11 @@ def _run(
             # sorted by environment, so those of a checkpoint follow each other
             columns = [collected.returns, collected.lengths, *collected.costs.values()]
             parts = zip(*(column.chunk(together) for column in columns), strict=True)
-            yield (
-                highest,
-                [
-                    Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
-                    for returns, lengths, *costs in parts
-                ],
-            )
+            found = [
+                Episodes(returns, lengths, dict(zip(keys, costs, strict=True)))
+                for returns, lengths, *costs in parts
+            ]
+            yield highest, found
             bar.update(batch)
 
 

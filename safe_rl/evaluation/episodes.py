@@ -186,18 +186,10 @@ def periodic_evaluation(
     """A function that runs whole episodes of the policy, without exploration, at regular intervals.
 
     It takes the numbers of steps before and after an epoch, and returns means over episodes if an
-    evaluation is due between them, else NaN. The worlds of an evaluation depend only on the seed
-    and the number of steps. So an evaluation does not change the random draws of training, and does
-    not depend on interruptions.
-
-    Args:
-        make_env: ``make_env(num_envs=, seed=)`` makes environments like the run's.
-        policy: The policy; it shares the parameters that are trained.
-        cost_keys: Keys of the costs to sum.
-        interval: Steps of training from one evaluation to the next.
-        episodes: Episodes per evaluation.
-        seed: Seed of worlds and actions, to which the steps of training are added.
-        fixed_layout: Whether all worlds have one layout, drawn from ``seed`` alone.
+    evaluation is due between them, else NaN: one is due every ``interval`` steps. The worlds of an
+    evaluation depend only on the seed and the number of steps (a fixed layout only on the seed). So
+    an evaluation does not change the random draws of training, and does not depend on
+    interruptions.
     """
     names = [f"evaluation_{name}" for name in ("return", *cost_keys)]
 

@@ -7,7 +7,7 @@ the configuration names, has changed.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,17 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
     """The run's environment with some keys changed; in a mapping, only the named entries change.
 
     Raises:
-        ValueError: As in `check_env_keys`; the package's own environments check their keys later.
+        ValueError: If a custom environment lacks a key, which it would ignore. The package's own
+            environments check their keys later.
     """
-    check_env_keys(config.env, overrides)
+    target = str(config.env.get("_target_", "safe_rl."))
+    known = [key for key in config.env if key not in ("_target_", "name")]
+    for key in () if target.startswith("safe_rl.") else overrides:
+        if key not in config.env:
+            raise ValueError(
+                f"env.{key}: {target} has no such key.{did_you_mean(key, known)} The run has "
+                f"{', '.join(known) or 'none'}."
+            )
     changed = OmegaConf.merge(config.env, dict(overrides))
     return OmegaConf.to_container(changed)  # type: ignore[return-value]
 
@@ -136,23 +144,3 @@ def load_policy(
                 "has diverged."
             )
     return policy.eval().requires_grad_(False)
-
-
-def check_env_keys(env: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse keys that a custom environment lacks, with a `ValueError`: it would ignore them.
-
-    Examples:
-        >>> check_env_keys({"_target_": "mine.make", "edge": 1.0}, ["edgy"])
-        Traceback (most recent call last):
-        ValueError: env.edgy: mine.make has no such key. Did you mean 'edge'? The run has edge.
-    """
-    target = str(env.get("_target_", "safe_rl."))
-    if target.startswith("safe_rl."):
-        return
-    known_keys = [key for key in env if key not in ("_target_", "name")]
-    for key in keys:
-        if key not in env:
-            known = f"The run has {', '.join(known_keys)}." if known_keys else "The run has none."
-            raise ValueError(
-                f"env.{key}: {target} has no such key.{did_you_mean(key, known_keys)} {known}"
-            )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -44,34 +44,36 @@ class Evaluation:
 
     def __str__(self) -> str:
         """A table for the terminal."""
-        facts = self.facts
+        facts, limits = self.facts, self.facts["cost_limits"]
         steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
         actions = "its mean actions" if facts["deterministic"] else "sampled actions"
+        measure = facts["limited_measure"]
+        other = "" if measure == "mean" else f" ({measure}, not mean)"
+        width = max(map(len, self.estimates))
         lines = [
             f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
             f"with {actions}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
-            *format_estimates(self.estimates, facts["cost_limits"], facts["limited_measure"]),
-            *format_limits_without_cost(facts["limits_without_cost"]),
-            *(f"wrote {path}" for path in self.files),
+            f"{'':{width}}  estimate [95 % interval]",
         ]
-        return "\n".join(lines)
+        for name, estimate in self.estimates.items():
+            key = name.removeprefix("episode_")
+            limit = f"   limit {limits[key]:g}{other}" if key in limits else ""
+            lines.append(f"{name:{width}}  {estimate}{limit}")
+        lines += [
+            f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"
+            for key, limit in facts["limits_without_cost"].items()
+        ]
+        return "\n".join([*lines, *(f"wrote {path}" for path in self.files)])
 
 
 @dataclass(frozen=True)
 class PolicyEvaluation:
-    """A run's policy in an environment, its own or a changed one.
+    """A run's policy in an environment, its own or a changed one."""
 
-    Attributes:
-        config: Configuration of the run; its ``env`` is the environment.
-        checkpoint: Checkpoint with the policy.
-        options: Options of the evaluation.
-        make_env: As in `evaluate`.
-    """
-
-    config: DictConfig
+    config: DictConfig  # of the run; its ``env`` is the environment
     checkpoint: Path
     options: EvaluationOptions
-    make_env: Callable[..., EnvBase]
+    make_env: Callable[..., EnvBase]  # as in `evaluate`
 
     @property
     def node(self) -> dict[str, Any]:
@@ -84,11 +86,11 @@ class PolicyEvaluation:
         seed = self.options.seed
         return default_seed(self.node, self.config.seed) if seed is None else seed
 
-    def make(self, num_envs: int, **keys: Any) -> EnvBase:
+    def make(self, num_envs: int, seed: int | None = None, **keys: Any) -> EnvBase:
         """Make environments, with some keys changed."""
         return for_evaluation(self.make_env, self.config)(
-            {**self.node, **keys}, num_envs=num_envs, device=self.options.device, seed=self.seed,
-            num_threads=self.options.num_threads,
+            {**self.node, **keys}, num_envs=num_envs, device=self.options.device,
+            seed=self.seed if seed is None else seed, num_threads=self.options.num_threads,
         )  # fmt: skip
 
     def policy(self, env: EnvBase) -> TensorDictModuleBase:
@@ -100,11 +102,8 @@ class PolicyEvaluation:
     ) -> tuple[Episodes, dict[str, Any]]:
         """Run whole episodes; returns them, and the facts: what was evaluated, how, and the limits.
 
-        Limits on costs that the environment lacks are listed apart.
-
-        Args:
-            progress: Whether to show a bar.
-            record: Folder to which all steps are written; None: they are not recorded.
+        Limits on costs that the environment lacks are listed apart. All steps are written to the
+        folder ``record``, if there is one.
         """
         options = self.options
         limits = {key: float(limit) for key, limit in self.config.cost_limits.items()}
@@ -190,7 +189,9 @@ def evaluate(
     films = [run.evaluation_file(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
     kept = [run.evaluation_file(options.name, "transitions")] if options.record else []
-    check_places(directory, [summary, table, *films])
+    check_no_links(directory)
+    for file in (summary, table, *films):
+        check_place(file, "A run's evaluations lie in its folder: evaluate a copy of that.")
     for film in films:
         with closing(evaluation.make(1, **drawing)) as single:
             check_camera(single, options.camera, film.suffix[1:])
@@ -210,13 +211,6 @@ def evaluate(
     for film in films:
         evaluation.film(film, **drawing)
     return Evaluation(facts, estimates, (summary, table, *kept, *films))
-
-
-def check_places(directory: Path, places: Iterable[Path]) -> None:
-    """Refuse a run's folder that holds links, and files that cannot be written."""
-    check_no_links(directory)
-    for place in places:
-        check_place(place, "A run's evaluations lie in its folder: evaluate a copy of that.")
 
 
 def summarise(
@@ -250,25 +244,3 @@ def summarise(
         if key in cost_limits:
             estimates[f"over_limit_{key}"] = share_over(costs, cost_limits[key])
     return estimates
-
-
-def format_estimates(
-    estimates: Mapping[str, Estimate], cost_limits: Mapping[str, float], measure: str
-) -> list[str]:
-    """Lines of a table for the terminal; `measure` of an episode's cost is what is limited."""
-    width = max(map(len, estimates))
-    other = "" if measure == "mean" else f" ({measure}, not mean)"
-    lines = [f"{'':{width}}  estimate [95 % interval]"]
-    for name, estimate in estimates.items():
-        key = name.removeprefix("episode_")
-        limit = f"   limit {cost_limits[key]:g}{other}" if key in cost_limits else ""
-        lines.append(f"{name:{width}}  {estimate}{limit}")
-    return lines
-
-
-def format_limits_without_cost(limits: Mapping[str, float]) -> list[str]:
-    """A line for each limit of the run on a cost that its changed environment does not have."""
-    return [
-        f"the run's limit {limit:g} on {key} is not judged: this environment has no such cost"
-        for key, limit in limits.items()
-    ]

@@ -132,14 +132,8 @@ def export_onnx(
 
     The input ``observation`` is float32 [N, D] for any N, before any scaling. The output ``action``
     [N, A] has the units and bounds of the environment itself. The file's metadata describe both,
-    and have the certificate if it covers these actions; their values are JSON.
-
-    Args:
-        run: The run.
-        env: An environment with its observations and actions.
-        checkpoint: The policy's weights.
-        file: The file to write.
-        sampled: Whether the graph samples its actions; else it returns their mean.
+    and have the certificate if it covers these actions; their values are JSON. The actions are
+    sampled, or else the mean ones.
 
     Raises:
         ModuleNotFoundError: If the extra ``onnx`` is not installed.

@@ -14,26 +14,19 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from safe_rl.evaluation.episodes import exploration
-from safe_rl.evaluation.settings import PICTURES
+from safe_rl.evaluation.settings import PICTURES, EvaluationOptions
 from safe_rl.extras import import_extra
 from safe_rl.files import replacing
 from safe_rl.naming import STEPS_TAKEN
 
 
 class VideoFormat(NamedTuple):
-    """Format in which an episode is recorded.
+    """Format in which an episode is recorded."""
 
-    Attributes:
-        width: Width of the picture in pixels, if the environment lets it be chosen.
-        height: Height of the picture in pixels, if the environment lets it be chosen.
-        steps_per_frame: Environment steps from one frame to the next.
-        frames_per_second: Frames per second of playback.
-    """
-
-    width: int
+    width: int  # [pixels], if the environment lets it be chosen
     height: int
-    steps_per_frame: int
-    frames_per_second: float
+    steps_per_frame: int  # environment steps
+    frames_per_second: float  # of playback
 
 
 FORMATS = {
@@ -43,7 +36,6 @@ FORMATS = {
     **dict.fromkeys(PICTURES, VideoFormat(400, 300, 5, 20)),
 }
 """Suffix of a file -> format in which an episode is recorded."""
-DEFAULT_CAMERA = "free"
 _CAPTION = 20  # height of the line below the picture [pixels]
 _FRAME = 0.04  # simulated time from one frame of an MP4 to the next [s]
 
@@ -76,7 +68,7 @@ def check_camera(env: EnvBase, camera: str, suffix: str = "mp4") -> None:
     asked = "video=true" if suffix == "mp4" else "picture=…"
     if env.render is None:
         raise ValueError(f"{asked}: this environment draws no pictures, it has no 'render'.")
-    if camera != DEFAULT_CAMERA and "camera" not in signature(env.render).parameters:
+    if camera != EvaluationOptions.camera and "camera" not in signature(env.render).parameters:
         raise ValueError(f"camera={camera}: this environment has no cameras to choose from.")
     env.reset()
     try:
@@ -109,7 +101,7 @@ def record_episode(
     *,
     deterministic: bool,
     form: VideoFormat,
-    camera: str = DEFAULT_CAMERA,
+    camera: str = EvaluationOptions.camera,
 ) -> Iterator[np.ndarray]:
     """Run one episode and yield its frames, uint8 [height, width, 3].
 

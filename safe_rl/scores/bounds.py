@@ -99,19 +99,12 @@ def betting_bound(values: ArrayLike, level: float, highest: float) -> float:
 
 @dataclass(frozen=True)
 class Statement:
-    """The statement that the mean over episodes of a value, such as the cost, is at most a limit.
+    """The statement that a mean over episodes, such as that of the cost, is at most a limit."""
 
-    Attributes:
-        name: Name of the mean.
-        limit: Limit of the mean.
-        highest: The largest possible value.
-        values: Value of every episode, [E].
-    """
-
-    name: str
+    name: str  # of the mean
     limit: float
-    highest: float
-    values: np.ndarray
+    highest: float  # the largest possible value
+    values: np.ndarray  # of every episode, [E]
 
     @property
     def is_by_construction(self) -> bool:
