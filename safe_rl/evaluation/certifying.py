@@ -191,7 +191,9 @@ def _ranked(
         costs = [_costs(*parts) for parts in episodes_of]
         claims = [claim.with_thresholds(of_candidate) for of_candidate in costs]
         returns = [torch.cat([part.returns for part in parts]).numpy() for parts in episodes_of]
-        places = rank(*([values[c] for c in tried] for values in (returns, costs, claims)))
+        places = rank(
+            [returns[c] for c in tried], [costs[c] for c in tried], [claims[c] for c in tried]
+        )
         order[:left] = [tried[place] for place in places]
         left = max(options.tests, -(-left // 2))
     return order, claims
