@@ -22,44 +22,31 @@ def note_code(path: Path, steps: int) -> None:
         entries = [entry for entry in read_json(path) if entry["steps"] < steps]
     except (OSError, ValueError, TypeError, KeyError):
         entries = []  # there is no file yet, or it is damaged
-    code = code_of()
+    code = code_of(Path(__file__))
     if not entries or any(entries[-1].get(name) != value for name, value in code.items()):
         entries.append({"steps": steps, **code})
     replace_json(path, entries)
 
 
 @cache
-def code_of() -> Mapping[str, Any]:
-    """The code of this process: ``version``, ``commit`` and ``changed``.
+def code_of(file: Path) -> Mapping[str, Any]:
+    """``version`` of the package; ``commit`` of a file's checkout, and whether that is ``changed``.
 
-    The last two are None if the package is not in a checkout, or Git is missing.
-
-    Examples:
-        >>> sorted(code_of())
-        ['changed', 'commit', 'version']
-    """
-    module = import_module("safe_rl")
-    commit, changed = commit_of(Path(str(module.__file__)))
-    return {"version": module.__version__, "commit": commit, "changed": changed}
-
-
-def commit_of(file: Path) -> tuple[str | None, bool | None]:
-    """The commit of the checkout that a file belongs to, and whether it has been changed since.
-
-    Both are None if Git does not track the file: an installed package may be inside the checkout of
-    another project.
+    The last two are None if Git does not track the file: an installed package may be inside the
+    checkout of another project.
 
     Examples:
-        >>> commit_of(Path("/nowhere/module.py"))
-        (None, None)
+        >>> code_of(Path("/nowhere/module.py"))["commit"] is None
+        True
     """
-    known = _git(file.parent, "ls-files", "--error-unmatch", file.name)
-    description = known and _git(
+    commit = _git(file.parent, "ls-files", "--error-unmatch", file.name) and _git(
         file.parent, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty"
     )
-    if not description:
-        return None, None
-    return description.removesuffix("-dirty"), description.endswith("-dirty")
+    return {
+        "version": import_module("safe_rl").__version__,
+        "commit": commit.removesuffix("-dirty") or None,
+        "changed": commit.endswith("-dirty") if commit else None,
+    }
 
 
 def _git(directory: Path, *arguments: str) -> str:

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import EngFormatter
 from matplotlib.transforms import ScaledTranslation
+from numpy.typing import ArrayLike
 
 from safe_rl.files import replacing
 from safe_rl.runs.table import final_width
@@ -68,8 +69,7 @@ def learning_curves(
     for index, key in enumerate(cost_limits or ["cost"]):
         colour = f"C{index + 1}"
         _draw(costs, steps, table[f"episode_{key}"], colour, key)
-        rate = table[f"{key}_rate"]
-        rates.plot(steps, rate, color=colour, label=key, marker=point_marker(steps))
+        _plot(rates, steps, table[f"{key}_rate"], colour, key)
         if key in cost_limits and measure != "mean" and f"violation_{key}" in table:
             judged = np.asarray(table[f"violation_{key}"], dtype=float) + cost_limits[key]
             _draw(costs, steps, judged, f"C{len(cost_limits) + index + 1}", f"{key} as limited")
@@ -79,9 +79,7 @@ def learning_curves(
             costs.axhline(limit, label=f"limit {limit:g}", **dashed)
             rates.axhline(per_step, label=f"limit / steps = {per_step:g}", **dashed)
         if key in multipliers:
-            heights = np.asarray(table[multipliers[key]], dtype=float)
-            marker = point_marker(steps)
-            more[0].plot(steps, heights, color=colour, label=f"λ of {key}", marker=marker)
+            _plot(more[0], steps, table[multipliers[key]], colour, f"λ of {key}")
     names = ("Return", "Episode cost", "Cost rate", "Multiplier")
     for axes, name in zip((returns, costs, rates, *more), names, strict=False):
         _label(figure, axes, name, from_zero=axes is not returns)
@@ -115,21 +113,14 @@ def _draw(
     if not known.any():
         axes.text(0.5, 0.5, "no episode has ended", transform=axes.transAxes, ha="center")
     steps, heights = steps[known], np.asarray(values, dtype=float)[known]
-    marker = point_marker(steps)
     width = final_width(steps)  # so that curves end at the final figures
-    mean = f"{label}, mean of {width} epochs"
     axes.plot(steps, heights, color=colour, alpha=0.3, linewidth=1, label=f"{label}, of an epoch")
-    axes.plot(steps, moving_mean(heights, width), color=colour, label=mean, marker=marker)
+    _plot(axes, steps, moving_mean(heights, width), colour, f"{label}, mean of {width} epochs")
 
 
-def point_marker(values: np.ndarray) -> str:
-    """Marker of a line through values, shape [n]; without it a single point is invisible.
-
-    Examples:
-        >>> point_marker(np.zeros(1)), point_marker(np.zeros(2))
-        ('o', '')
-    """
-    return "o" if len(values) == 1 else ""
+def _plot(axes: Axes, steps: np.ndarray, values: ArrayLike, colour: str, label: str) -> None:
+    # without a marker a single point is invisible
+    axes.plot(steps, values, color=colour, label=label, marker="o" if len(steps) == 1 else "")
 
 
 def moving_mean(values: np.ndarray, width: int) -> np.ndarray:

@@ -41,10 +41,6 @@ class TensorboardLogger(TorchRLTensorboardLogger):
     def log_hparams(self, cfg: Mapping[str, Any]) -> None:
         """Log no settings: TorchRL's method would make another run of TensorBoard for them."""
 
-    def close(self, timeout: float | None = None) -> None:
-        """Write what is buffered."""
-        self.experiment.close()
-
 
 @checked
 class MLflowLogger(MLFlowLogger):
@@ -105,7 +101,3 @@ class WandbLogger(TorchRLWandbLogger):
         super().__init__(
             exp_name, offline=offline, project=project, log_dir=log_dir, id=run_id, **kwargs
         )
-
-    def close(self, timeout: float | None = None) -> None:
-        """End the run, so that this process can begin another one."""
-        self.experiment.finish()

@@ -17,13 +17,15 @@ LINE_SECONDS = "SAFE_RL_LINE_SECONDS"
 """Environment variable of runs that share a terminal: they print lines, this many seconds apart."""
 
 
-class ProgressBar:
+class ProgressBar(tqdm):
     """A bar with steps, steps per second, return, and costs with their present limits.
 
     Args:
         directory: Folder of the run; if lines replace the bar, they begin with its name.
         total: Environment steps of the whole run.
         begun: Steps that a continued run has made before.
+        limits: Cost key -> d, undiscounted cost per episode.
+        measure: Which measure of episode costs is limited.
     """
 
     def __init__(
@@ -34,31 +36,23 @@ class ProgressBar:
         limits: Mapping[str, float],
         measure: str = "mean",
     ) -> None:
-        self._name = os.path.relpath(directory)
-        self._seconds = float(os.environ.get(LINE_SECONDS, "inf"))
-        self._printed = monotonic()
-        options = {"disable": True} if math.isfinite(self._seconds) else {}
-        self._bar = tqdm(
+        self._limits, self._measure = limits, measure
+        self._seconds, self._printed = float(os.environ.get(LINE_SECONDS, "inf")), monotonic()
+        # a delayed bar draws nothing by itself
+        lines = math.isfinite(self._seconds)
+        options = {"delay": math.inf, "desc": os.path.relpath(directory)} if lines else {}
+        super().__init__(
             total=total, initial=begun, unit=" steps", unit_scale=True, dynamic_ncols=True,
             smoothing=0.1, **options,
         )  # fmt: skip
-        self._limits, self._measure = limits, measure
 
     def add(self, row: Mapping[str, float]) -> None:
         """Show an epoch, given as its row of the table."""
-        figures = shown(row, self._limits, self._measure)
-        self._bar.set_postfix(figures, refresh=False)
-        self._bar.update(int(row["steps"]) - self._bar.n)
+        self.set_postfix(shown(row, self._limits, self._measure), refresh=False)
+        self.update(int(row["steps"]) - self.n)
         if monotonic() - self._printed >= self._seconds:
             self._printed = monotonic()
-            words = [f"{row['steps'] / self._bar.total:.0%} of {self._bar.total:,} steps"]
-            words += [f"{row['steps_per_second']:,.0f} steps/s"]
-            words += [f"{name}={value}" for name, value in figures.items()]
-            print(f"{self._name}: {', '.join(words)}", file=sys.stderr, flush=True)
-
-    def close(self) -> None:
-        """Close the bar; its last state stays on the terminal."""
-        self._bar.close()
+            print(self, file=sys.stderr, flush=True)
 
 
 def shown(

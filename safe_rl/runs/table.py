@@ -102,11 +102,7 @@ def _field(value: float) -> str:
 
 
 def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
-    """Numbers of a table by columns.
-
-    Raises:
-        TableError: If a row has more or fewer fields than the header, or a field is no number.
-    """
+    """Numbers of a table by columns; a TableError says which line or field is wrong."""
     names, *rows = csv.reader(lines)
     if len(names) > _MOST_COLUMNS:
         raise TableError(f"{path} has {len(names):,} columns, more than any run writes.")
@@ -118,14 +114,13 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
             )
     try:
         columns = zip(*rows, strict=True) if rows else ([] for _ in names)
-        return {name: list(map(_number, c)) for name, c in zip(names, columns, strict=True)}
+        # always the same NaN object: tables with equal numbers are equal
+        return {
+            name: [float(field) if field else math.nan for field in column]
+            for name, column in zip(names, columns, strict=True)
+        }
     except ValueError as error:
         raise TableError(f"{path} has a field that is no number: {error}.") from None
-
-
-def _number(field: str) -> float:
-    # always the same NaN object: tables with equal numbers are equal
-    return float(field) if field else math.nan
 
 
 def read_table(path: Path) -> dict[str, list[float]]:
@@ -293,14 +288,10 @@ def outcome_line(
         return f"No episode{steps} has ended; {speed}"
     what = f"Return {final['episode_return']:.2f}"
     for key in keys:
-        limit = f" (limit {limits[key]:g})" if key in limits else ""
-        what += f", {key} {_final_cost(final, key, limits.get(key), measure)}{limit}"
+        mean, limited = final[f"episode_{key}"], measured(final, key, limits.get(key), measure)
+        what += f", {key} {mean:.1f}"
+        what += f", limited measure {limited:.1f}" if abs(limited - mean) > 0.05 else ""
+        what += f" (limit {limits[key]:g})" if key in limits else ""
     begin = 0 if rows[0] == 0 else table["steps"][rows[0] - 1]
     span = f"steps {begin + 1:,.0f} to {table['steps'][rows[-1]]:,.0f}"
     return f"{what} per episode, mean of {span}; {speed}"
-
-
-def _final_cost(final: Mapping[str, float], key: str, limit: float | None, measure: str) -> str:
-    mean, limited = final[f"episode_{key}"], measured(final, key, limit, measure)
-    differs = abs(limited - mean) > 0.05
-    return f"{mean:.1f}" + (f", limited measure {limited:.1f}" if differs else "")

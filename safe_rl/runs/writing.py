@@ -24,41 +24,23 @@ from safe_rl.trust import instantiate
 
 @dataclass
 class RunWriter:
-    """Writes configuration, versions of the code, table, logger, curves and bar of one run.
-
-    Args:
-        run: The run; its folder is made if it does not exist.
-        config: Configuration of the run.
-        cost_limits: Cost key -> d, undiscounted cost per episode.
-        episode_length: T_ep, steps of a full episode.
-
-    Raises:
-        ValueError: If ``MPLBACKEND`` names a backend that Matplotlib does not have.
-    """
+    """Writes configuration, versions of the code, table, logger, curves and bar of one run."""
 
     run: Run
     config: DictConfig
-    cost_limits: Mapping[str, float]
-    episode_length: int
-
-    def __post_init__(self) -> None:
-        # imported here, so that a wrong MPLBACKEND is an error before the run begins
-        import matplotlib  # noqa: F401
-
-        self._measure = measure_of(self.config)
+    cost_limits: Mapping[str, float]  # cost key -> d, undiscounted cost per episode
+    episode_length: int  # T_ep, steps of a full episode
 
     @contextmanager
     def writing(self, epoch: int | None = None, steps: int = 0) -> Iterator[None]:
-        """Keep logger and bar open, and the folder locked.
+        """Keep logger and bar open, and the folder, which is made if it is missing, locked.
 
-        Args:
-            epoch: Epochs that a continued run has made before; None for a new run.
-            steps: Environment steps that it has made before.
+        A continued run has made `epoch` epochs and `steps` environment steps before; `epoch` is
+        None for a new run.
 
         Raises:
-            RunInUseError: If another process writes into the folder.
-            SettingError: If the logger cannot be made of its settings.
-            ValueError: If the table lacks epochs of the continued run.
+            RunInUseError, SettingError, TableError: If another process writes into the folder, the
+                logger cannot be made, or the table lacks epochs of the continued run.
         """
         self.run.directory.mkdir(parents=True, exist_ok=True)
         with lock_folder(self.run.lock_file), ExitStack() as opened:
@@ -78,26 +60,19 @@ class RunWriter:
             # whole batches, so that the last one does not go beyond the bar
             batch = self.config.frames_per_batch
             total = math.ceil(self.config.frames / batch) * batch
-            directory, limits = self.run.directory, self.cost_limits
-            self._bar = ProgressBar(directory, total, steps, limits, self._measure)
-            opened.callback(self._bar.close)
+            measure = measure_of(self.config)
+            self._bar = opened.enter_context(
+                ProgressBar(self.run.directory, total, steps, self.cost_limits, measure)
+            )
             yield
-            self._save_config()
 
     def _make_logger(self) -> Any:
         try:
-            logger = instantiate(self.config.get("logger"), log_dir=str(self.run.directory))
+            return instantiate(self.config.get("logger"), log_dir=str(self.run.directory))
         except (SettingError, OSError):
             raise
         except Exception as error:  # those of the services have types of their own
             raise SettingError(f"logger: {' '.join(str(error).split())}") from error
-        for name in ("log_scalar", "log_hparams", "close"):
-            if logger is not None and not callable(getattr(logger, name, None)):
-                raise SettingError(
-                    f"logger._target_={self.config.logger._target_}: it has no '{name}'. Derive a "
-                    "logger of yours from torchrl.record.loggers.Logger."
-                )
-        return logger
 
     def _save_config(self) -> None:
         if not self._is_config_saved:
@@ -124,15 +99,14 @@ class RunWriter:
 
     def draw_curves(self) -> None:
         """Write ``curves.png`` from the table; if that fails, say so: training goes on."""
-        # imported here: matplotlib takes half a second
-        from safe_rl.runs.curves import learning_curves, save_figure
-
         table, config = read_table(self.run.table_file), self.config
         title = f"{config.env.name} {config.algo.name} seed {config.seed}"
+        limits, length, measure = self.cost_limits, self.episode_length, measure_of(config)
         try:
-            figure = learning_curves(
-                table, self.cost_limits, self.episode_length, title, self._measure
-            )
+            # imported here: matplotlib takes half a second, and refuses an unknown MPLBACKEND
+            from safe_rl.runs.curves import learning_curves, save_figure
+
+            figure = learning_curves(table, limits, length, title, measure)
             save_figure(figure, self.run.curves_file)
         except (OSError, RuntimeError, ValueError) as error:  # such as text.usetex without LaTeX
             reason = " ".join(str(error).split())
@@ -140,6 +114,6 @@ class RunWriter:
 
     def summary(self) -> str:
         """One line about the end of the run."""
-        table = read_table(self.run.table_file)
-        line = outcome_line(table, self.cost_limits, self.episode_length, self._measure)
+        table, measure = read_table(self.run.table_file), measure_of(self.config)
+        line = outcome_line(table, self.cost_limits, self.episode_length, measure)
         return f"{line}; {self.run.directory}"

@@ -103,8 +103,9 @@ def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
     bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0})
     bar.add({**row, "multiplier_cost": 0.5})
     bar.close()
-    line = "seed0: 25% of 1,000 steps, 5,000 steps/s, return=1.50, cost=30.0/25, λ=0.5\n"
-    assert capsys.readouterr().err == line
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("seed0:  25%")
+    assert line.endswith("steps/s, return=1.50, cost=30.0/25, λ=0.5]")
 
 
 @pytest.mark.parametrize(

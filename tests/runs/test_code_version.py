@@ -7,7 +7,7 @@ import pytest
 
 import safe_rl
 from safe_rl.runs import code_version
-from safe_rl.runs.code_version import code_of, commit_of, note_code
+from safe_rl.runs.code_version import code_of, note_code
 from safe_rl.runs.run import Run
 
 
@@ -34,17 +34,20 @@ def checkout(tmp_path, monkeypatch):
 
 def test_the_commit_is_gits_and_a_change_is_told(checkout):
     module, git = checkout
-    assert commit_of(module) == (git("rev-parse", "HEAD"), False)
+    commit = {"version": safe_rl.__version__, "commit": git("rev-parse", "HEAD")}
+    assert code_of(module) == commit | {"changed": False}
     (module.parent / "notes.txt").write_text("not under version control")
-    assert commit_of(module)[1] is False
+    code_of.cache_clear()
+    assert code_of(module)["changed"] is False
     module.write_text("x = 2\n")
-    assert commit_of(module) == (git("rev-parse", "HEAD"), True)
+    code_of.cache_clear()
+    assert code_of(module) == commit | {"changed": True}
 
 
 def test_a_tag_does_not_stand_for_the_commit(checkout):
     module, git = checkout
     git("tag", "--annotate", "v1", "--message=one")
-    assert commit_of(module)[0] == git("rev-parse", "HEAD")
+    assert code_of(module)["commit"] == git("rev-parse", "HEAD")
 
 
 def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
@@ -52,7 +55,8 @@ def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
     installed = module.parent / "site-packages" / "module.py"
     installed.parent.mkdir()
     installed.write_text("x = 1\n")
-    assert commit_of(installed) == (None, None)
+    known = code_of(installed)
+    assert (known["commit"], known["changed"]) == (None, None)
 
 
 def test_without_git_a_run_is_noted_all_the_same(tmp_path, monkeypatch):
@@ -69,7 +73,7 @@ def test_code_that_resumes_a_run_stands_below_what_began_it(tmp_path, monkeypatc
 
     def noted(commit, steps):
         known = {"version": "1", "commit": commit, "changed": False}
-        monkeypatch.setattr(code_version, "code_of", lambda: known)
+        monkeypatch.setattr(code_version, "code_of", lambda file: known)
         note_code(path, steps)
         return [(entry["steps"], entry["commit"]) for entry in json.loads(path.read_text())]
 
