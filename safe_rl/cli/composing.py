@@ -45,8 +45,7 @@ RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
 COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
-    # Hydra's of logger=null and model=[1], OmegaConf's of missing sections
-    *(ValueError, TypeError, AttributeError),
+    *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
 )
 
 
@@ -55,14 +54,10 @@ def compose_run(
 ) -> DictConfig:
     """Compose the configuration of one run, with its node ``hydra``.
 
-    Args:
-        words: Overrides, ``key=value``.
-        folders: Folders with YAML files of one's own, as ``--config-dir`` names them.
-        name: Name of the primary configuration.
+    `words` are overrides, `folders` those of ``--config-dir``, `name` is the primary configuration.
 
     Raises:
-        ValueError: If a folder does not exist, or Hydra refuses a word or a file; the message is
-            one line.
+        ValueError: If a folder does not exist, or Hydra refuses a word or a file, in one line.
 
     Examples:
         >>> compose_run(["env=CarGoal1", "seed=3"]).seed
@@ -70,14 +65,14 @@ def compose_run(
     """
     store_configs()
     places = [Path(folder).expanduser().absolute() for folder in folders]
-    for missing in (place for place in places if not place.is_dir()):
-        raise ValueError(f"config_dir={missing}: there is no such folder.")
+    for place in places:
+        if not place.is_dir():
+            raise ValueError(f"config_dir={place}: there is no such folder.")
     words = [*_searched(places), *words]
     try:
         config = _compose(words, name)
     except COMPOSITION_ERRORS as error:
-        given = [f"--config-name={name}", *words]
-        raise ValueError(explain(error, given)) from error
+        raise ValueError(explain(error, [f"--config-name={name}", *words])) from error
     name_choices(config, config.hydra)
     return config
 
@@ -125,10 +120,7 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
-    """Write settings from Python as overrides of Hydra.
-
-    Raises:
-        ValueError: If a value has a type that overrides cannot express.
+    """Write settings from Python as overrides of Hydra; ValueError for a value of another type.
 
     Examples:
         >>> list(overrides_of({"model": {"hidden_sizes": [8]}, "seed": 3, "note": None}))
@@ -156,22 +148,13 @@ def _written(value: Any) -> str:
 
 
 def explain(error: Exception, words: Sequence[str]) -> str:
-    """What is wrong with a command, in one line that names the nearest right word.
-
-    Raises:
-        AttributeError, TypeError: The error, if it is one that no word explains.
-    """
+    """What is wrong with a command, in one line; an AttributeError of another cause is raised."""
     if isinstance(error, OverrideParseException):
         return unreadable(str(error.override), error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _unknown_choice(error)
     if str(error).startswith("Config group override must be"):
         return _unnamed_choice(words) or str(error)
-    if isinstance(error, TypeError):
-        lists = [word for word in words if re.match(r"\w+=\[[^\]]*\b\d", word)]
-        if not lists:
-            raise error
-        return f"{lists[0]}: this is no list of names of files."
     if type(error) is AttributeError:
         missing = re.search(r"full_key: (\w+)\.\S+\s+object_type=General", str(error))
         if missing is None:
@@ -198,8 +181,6 @@ def explain(error: Exception, words: Sequence[str]) -> str:
 def _unknown_choice(error: MissingConfigException) -> str:
     """A message about a file that does not exist, such as ``env=PointGaol1``."""
     group, _, name = str(error.missing_cfg_file).rpartition("/")
-    if (group, name) == ("preset", "paper"):
-        return "there is no preset 'paper'. For its numbers write algo=paper/cpo, and so on."
     known = list(error.options or ())
     if not known:
         known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
@@ -273,14 +254,10 @@ def read_resumed(
 ) -> dict[str, Any]:
     """Read a run's configuration as a primary configuration for Hydra.
 
-    Args:
-        directory: Folder of the run.
-        modules: Modules of ``import=``; None if the command does not have it.
-        words: The other words of the command.
+    `modules` are those of ``import=``, None without it; `words` the others of the command.
 
     Raises:
-        ValueError: If it is not the folder of a run that can be continued, or if a word does not
-            go with ``resume=``.
+        ValueError: If the run cannot be continued, or a word does not go with ``resume=``.
     """
     config = _read(directory)
     check_imports(config, modules, directory)
@@ -333,11 +310,7 @@ def _refuse_foreign_cluster(
 
 
 def refuse_changes(directory: Path, config: DictConfig) -> None:
-    """Refuse a configuration that differs from the run's in a key that has to stay.
-
-    Raises:
-        ValueError: If there is such a key; the message names it.
-    """
+    """Refuse, by a ValueError, a configuration that differs from the run's in a key that stays."""
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     given: Any = OmegaConf.to_container(settings, resolve=True)
     if changed := differences(Run(directory).settings, given, "may_change"):

@@ -190,18 +190,15 @@ _STORE.store(group="model", name="mlp", node={"encoders": None, "memory": None})
 
 _PARTS = ("critic_update", "memory", "limits", "lagrangian", "advantage", "cost_advantage", "actor")
 
+# parts that the algorithms which have them cannot do without
 _NEEDED = ("loss", "policy_update", "critic_update", "advantage", "actor", "memory", "critics")
-"""Parts that the algorithms which have them cannot do without."""
 
 
 def check_settings(config: DictConfig) -> None:
-    """Check a composed configuration, before anything is built.
+    """Check a composed configuration, before anything is built; a SettingError names a wrong key.
 
     Sections that its algorithm does not have are removed, and whole numbers that are written as 3e5
     become integers.
-
-    Raises:
-        SettingError: For a key that does not exist or is out of range; the message names it.
     """
     try:
         with open_dict(config):
@@ -298,12 +295,8 @@ def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> 
 
 def keys_of(config: DictConfig) -> list[str]:
     """Full keys of all values of a configuration."""
-    plain = {
-        str(key): OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        for key, value in config.items_ex(resolve=False)
-        if key != "hydra"
-    }
-    return list(flatten(plain))
+    plain: Any = OmegaConf.to_container(config)
+    return [key for key in flatten(plain) if not key.startswith("hydra.")]
 
 
 def unknown_key(key: str, known: Iterable[str]) -> str:

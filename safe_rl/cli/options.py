@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 Options = TypeVar("Options", bound="DataclassInstance")
 _FORMAT = warnings.formatwarning
+_EXPECTED = (ValueError, OSError, RuntimeError, ImportError, MemoryError, OmegaConfBaseException)
 
 
 class OptionError(ValueError):
@@ -52,7 +53,7 @@ def read_options(words: Iterable[str], schema: type[Options]) -> Options:
     """Read options from words ``key=value``; nested keys have dots.
 
     Raises:
-        OptionError: If a word is no option of the dataclass (the message names the nearest one).
+        OptionError: If a word is no option of the dataclass.
         SettingError: If an option has a value that its annotation does not allow.
 
     Examples:
@@ -61,24 +62,25 @@ def read_options(words: Iterable[str], schema: type[Options]) -> Options:
         {'hazards_num': 3}
     """
     kinds = get_type_hints(schema, include_extras=True)
-    given: list[tuple[str, Any]] = []
+    given: dict[str, Any] = {}
     for word in words:
         key, equals, text = word.partition("=")
         if not equals:
             raise OptionError(f"'{word}' is not an option: they are written key=value.")
         # texts are taken literally: the grammar would change `off` and `007`, and refuse `it's`
         is_text = _is_text(kinds.get(key)) and text[:1] not in ("'", '"') and text != "null"
-        given.append((key, text if is_text else _value(word)))
+        try:
+            given[key] = text if is_text else OverridesParser.create().parse_override(word).value()
+        except HydraException as error:
+            raise OptionError(unreadable(word, error)) from None
     return make_options(given, schema)
 
 
-def make_options(
-    given: Mapping[str, Any] | Iterable[tuple[str, Any]], schema: type[Options]
-) -> Options:
+def make_options(given: Mapping[str, Any], schema: type[Options]) -> Options:
     """Make options of keys, which may have dots, and values; errors as of `read_options`."""
     kinds = get_type_hints(schema, include_extras=True)
     read = OmegaConf.create()
-    for key, value in given.items() if isinstance(given, Mapping) else given:
+    for key, value in given.items():
         name = key.partition(".")[0]
         if name not in kinds:
             raise OptionError(
@@ -97,13 +99,6 @@ def _is_text(kind: Any) -> bool:
         return isinstance(get_args(kind)[0], str)
     inner = get_args(kind) if get_origin(kind) in (Annotated, Union, UnionType) else ()
     return kind is str or any(map(_is_text, inner))
-
-
-def _value(word: str) -> Any:
-    try:
-        return OverridesParser.create().parse_override(word).value()
-    except HydraException as error:
-        raise OptionError(unreadable(word, error)) from None
 
 
 def unreadable(word: str, error: Exception) -> str:
@@ -150,10 +145,9 @@ def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def split_imports(words: Sequence[str]) -> tuple[list[str] | None, list[str]]:
-    """Separate ``import=``, which may be repeated or hold a list, from the other words.
+    """Separate the modules of ``import=``, repeated or a list, from the other words.
 
-    Returns:
-        The modules, or None if ``import=`` is not given; and the other words.
+    The modules are None if ``import=`` is not given.
     """
     given, others = take_word("import", words)
     modules = [name.strip() for text in given for name in text.strip("[]").split(",")]
@@ -179,8 +173,7 @@ def run_command(
 ) -> int:
     """Read the arguments of a command, and run it or print its help; return its exit status.
 
-    An error is printed as one line; ``HYDRA_FULL_ERROR=1`` shows the traceback instead. After
-    Ctrl-C the process ends by that signal, so that a shell's loop over commands ends as well.
+    An error is printed as one line; ``HYDRA_FULL_ERROR=1`` shows the traceback instead.
 
     Args:
         work: Function of the positional arguments, the options, and the modules of ``import=`` or
@@ -199,14 +192,7 @@ def run_command(
         return 0 if is_help else 2
     try:
         return work(words[:places], read_options(words[places:], schema), modules)
-    except (
-        ValueError,
-        OSError,
-        RuntimeError,
-        ImportError,
-        MemoryError,
-        OmegaConfBaseException,
-    ) as error:
+    except _EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         print(f"error: {printable(str(error) or type(error).__name__)}", file=sys.stderr)

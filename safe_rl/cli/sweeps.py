@@ -40,8 +40,7 @@ _failed: set[str] = set()  # folders of the jobs of this process that have faile
 def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> float:
     """Begin or continue the run of one job; a failure is written into its folder.
 
-    Returns:
-        The value of `run_job`, which an optimising sweeper maximises; −∞ if the job fails.
+    The value is that of `run_job`, which an optimising sweeper maximises; −∞ if the job fails.
     """
     run = Run(directory)
     _failed.discard(str(directory))
@@ -66,12 +65,7 @@ def run_in_sweep(config: DictConfig, settings: HydraConf, directory: Path) -> fl
 def run_job(config: DictConfig, settings: HydraConf, run: Run) -> float:
     """Train the run of a job; a finished one is skipped, an interrupted one goes on.
 
-    Returns:
-        The run's final return, or −∞ if it ends above a limit or no episode has ended.
-
-    Raises:
-        SystemExit: If it is interrupted.
-        ValueError: If its folder holds a run with other settings.
+    The value is the run's final return, or −∞ if it ends above a limit or no episode has ended.
     """
     from safe_rl.training.train import complete, train  # with torch: a sweep starts without it
 
@@ -87,11 +81,7 @@ def run_job(config: DictConfig, settings: HydraConf, run: Run) -> float:
 
 
 def check_same_run(config: DictConfig, run: Run) -> None:
-    """Refuse to continue a run with other settings; length and machine may differ.
-
-    Raises:
-        ValueError: If other settings differ; the message names every key.
-    """
+    """Refuse, by a ValueError, to continue a run with other settings but length and machine."""
     given: Any = OmegaConf.to_container(config, resolve=True)
     if changed := differences(run.settings, given):
         changes = ", ".join(f"{key}: {before} -> {now}" for key, (before, now) in changed.items())
@@ -112,12 +102,9 @@ class Summary(Callback):
         self._log, self._process = Path(log).absolute(), os.getpid()
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Let jobs at a time share the cores.
-
-        Raises:
-            SystemExit: If the folder of the sweep has no name; Hydra would only warn of others.
-        """
+        """Let jobs at a time share the cores."""
         if not config.hydra.sweep.dir:
+            # of other errors Hydra would only warn
             sys.exit("hydra.sweep.dir= is empty: it names the folder of the sweep.")
         self._log.parent.mkdir(parents=True, exist_ok=True)
         workers = config.hydra.launcher.get("n_jobs")
@@ -153,11 +140,7 @@ class Summary(Callback):
             file.write(json.dumps(note) + "\n")
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        """Print how the jobs have ended.
-
-        Raises:
-            SystemExit: With status 1, if a run is not finished, or if there is none.
-        """
+        """Print how the jobs have ended; the status is 0 only if all runs are finished."""
         lines = self._log.read_text().splitlines() if self._log.exists() else []
         last = {job: (state, place) for job, state, place in map(json.loads, lines)}.values()
         if not last:

@@ -45,10 +45,8 @@ from safe_rl.trust import import_modules
 def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
     """Run a function of ``@hydra.main``, with ``import=``, ``slate=`` and ``resume=``.
 
-    The words are the command's arguments; None: those of the process.
-
-    Raises:
-        SystemExit: With a message of one line, if the words cannot be used.
+    The words are the command's arguments; None: those of the process. If they cannot be used, the
+    process ends with a message of one line.
     """
     keep_streams()
     argv, full_error = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
@@ -75,16 +73,18 @@ def prepare(words: Sequence[str]) -> list[str]:
 
     ``import=my_module`` is imported; ``slate=SG6`` becomes the slate's environments (Ray, Achiam,
     Amodei 2019, section 5.1); for ``resume=RUN`` the run's own configuration takes the place of
-    ``conf/config.yaml``.
-
-    Raises:
-        ValueError: If a module, a slate, a run or a word cannot be used.
+    ``conf/config.yaml``. A ValueError says what cannot be used.
 
     Examples:
         >>> prepare(["-m", "slate=SGPoint", "seed=0"])
         ['env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0', '-m']
     """  # noqa: E501
-    store_configs(_shown(words))
+    # To list its groups for a help, Hydra copies the store a hundred times: ten seconds with all
+    # environments. But a file of the user's may build on any of them.
+    has_files = any(word.startswith(("-c", "--config-", "hydra.searchpath=")) for word in words)
+    shown = [word.removeprefix("env=") for word in words if word.startswith("env=")]
+    is_help = bool({"--help", "-h"} & {*words}) and not has_files
+    store_configs((shown or ["PointGoal1"]) if is_help else None)
     modules, words = split_imports(words)
     import_modules(modules)
     runs, words = take_word("resume", words)
@@ -118,28 +118,11 @@ def _is_of_flags(before: str, word: str) -> bool:
     return word.startswith("-") or bool(takes_any or (takes_plain and "=" not in word))
 
 
-def _shown(words: Sequence[str]) -> list[str] | None:
-    """Environments whose keys the store needs for a help; None: all, also if no help is asked for.
-
-    To list its groups Hydra copies the store a hundred times: ten seconds with all environments.
-    But a file of the user's may build on any of them.
-    """
-    has_files = any(word.startswith(("-c", "--config-", "hydra.searchpath=")) for word in words)
-    if has_files or not {"--help", "-h"} & {*words}:
-        return None
-    chosen = [word.removeprefix("env=") for word in words if word.startswith("env=")]
-    return chosen or ["PointGoal1"]  # the default of conf/config.yaml
-
-
 def job(config: DictConfig) -> float | None:
     """Begin or continue the run of a configuration that Hydra has composed.
 
-    Returns:
-        In a sweep the value that an optimising sweeper maximises: the final return, or −∞ if the
-        run fails, ends above a limit, or ends before its first episode does.
-
-    Raises:
-        SystemExit: If a signal ends the run, or with a message of one line if it cannot go on.
+    In a sweep the value is that of `run_in_sweep`. The process ends if a signal ends the run, or
+    with a message of one line if it cannot go on.
     """
     settings = HydraConfig.get()
     directory = Path(settings.runtime.output_dir)
@@ -151,8 +134,7 @@ def job(config: DictConfig) -> float | None:
     try:
         if is_resumed:
             refuse_changes(directory, config)
-        else:
-            name_choices(config, settings)
+        name_choices(config, settings)
         check_settings(config)
     except (OmegaConfBaseException, ValueError) as error:
         with suppress(OSError):

@@ -99,13 +99,7 @@ def common_source(source: str) -> str:
 
 
 def new_folder(wanted: Path) -> Path:
-    """Make the folder of a new run; if it exists, its name gets a number.
-
-    Raises:
-        ValueError: If the path is empty.
-    """
-    if wanted == Path():
-        raise ValueError("hydra.run.dir is empty: it names the folder of the run.")
+    """Make the folder of a new run; if it exists, its name gets a number."""
     wanted = wanted.expanduser().absolute()
     for number in count(1):
         path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
@@ -130,7 +124,6 @@ def lock_folder(file: Path) -> Iterator[None]:
 
     Raises:
         RunInUseError: If another process holds the lock.
-        OSError: If the folder cannot be written.
         ValueError: If the folder holds links, which could lead writing elsewhere.
     """
     directory = file.parent
