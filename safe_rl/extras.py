@@ -19,14 +19,10 @@ _PLUGINS = {
 
 
 def require_extra(module: str, extra: str) -> None:
-    """Check that a package which comes with one of the extras is there, without importing it.
-
-    Args:
-        module: Name of the module, or of one in the package.
-        extra: The extra that installs it.
+    """Check that the package of a module is there, without importing it.
 
     Raises:
-        ModuleNotFoundError: If it is not installed; the message says how to install it.
+        ModuleNotFoundError: If it is not; the message says how to install it by the `extra`.
     """
     package = module.partition(".")[0]
     if find_spec(package) is None:
@@ -68,11 +64,7 @@ def import_later(
     """Return a package's ``__getattr__`` (PEP 562) and ``__dir__``: names that are imported late.
 
     Help and error messages need names of environments and keys, but not torch, TorchRL and MuJoCo,
-    which take seconds to import.
-
-    Args:
-        package: Name of the package.
-        homes: Module, named from the package -> names that it defines.
+    which take seconds to import. `homes` maps modules, named from the package, to their names.
     """
     modules = {name: f"{package}.{home}" for home, names in homes.items() for name in names}
 

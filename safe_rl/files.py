@@ -1,4 +1,4 @@
-"""Files of a run: read without trusting them, written atomically.
+"""Files of a run: read without trusting them, written atomically. Any may raise an OSError.
 
 This is directly in ``safe_rl/``, because several folders write files of a run.
 """
@@ -78,7 +78,6 @@ def read_bounded(path: Path, most: int = _MOST_BYTES, *, packed: bool = False) -
     Raises:
         ValueError: If it is larger, also after unpacking, or not a regular file: reading a pipe
             could wait forever.
-        OSError: If it cannot be read.
     """
     # without O_NONBLOCK, opening a pipe waits for a writer
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
@@ -103,7 +102,6 @@ def read_json(path: Path) -> Any:
 
     Raises:
         ValueError: If it is not JSON, is too large, or nested too deeply.
-        OSError: If it cannot be read.
     """
     try:
         return all_printable(json.loads(read_bounded(path)))
@@ -117,7 +115,6 @@ def read_yaml(path: Path) -> Any:
     Raises:
         ValueError: If it is not YAML, is too large or nested too deeply, or has aliases, with which
             a small file could fill the memory.
-        OSError: If it cannot be read.
     """
     try:
         text, level = read_bounded(path).decode("utf-8"), 0
@@ -145,7 +142,6 @@ def read_config(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: If it is not a mapping whose keys are texts, or has interpolations, control
             characters or aliases.
-        OSError: If it cannot be read.
 
     Examples:
         >>> path = getfixture("tmp_path") / "config.yaml"
@@ -222,9 +218,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 def load_tensors(path: Path, *, lazy: bool = False) -> Any:
     """Read a file of `save_tensors` into main memory, also of another person; no code in it is run.
 
-    Args:
-        path: The file.
-        lazy: Whether tensors are read from the file only when they are used, without a check.
+    With `lazy`, tensors are read only when they are used, without a check of the file.
 
     Raises:
         ValueError: If the file cannot be read.
@@ -260,10 +254,7 @@ def check_no_links(folder: Path) -> None:
 
     Files written or removed through links could lie anywhere, and opening a pipe waits. The path of
     the folder itself may have links. ``wandb/`` may hold links, because Weights & Biases makes
-    some, and nothing else writes there.
-
-    Raises:
-        ValueError: If there is a link or a pipe; the message names the first one.
+    some, and nothing else writes there. A ValueError names the first link or pipe.
     """
     for place, folders, files in os.walk(folder):
         for path in (Path(place, name) for name in (*folders, *files)):
@@ -281,15 +272,7 @@ def check_no_links(folder: Path) -> None:
 
 
 def check_place(path: Path, otherwise: str) -> None:
-    """Check that a file can be written, before the work that makes its content.
-
-    Args:
-        path: The file; folders above it may be missing.
-        otherwise: Advice for the error, a sentence.
-
-    Raises:
-        OSError: If it is a folder, or cannot be made.
-    """
+    """Raise an OSError, which ends with an advice, if a file and its folders cannot be written."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder, where a file is to be written. {otherwise}")
     above = next(folder for folder in path.parents if folder.exists())

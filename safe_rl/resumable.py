@@ -97,12 +97,9 @@ def _check_shape(name: str, current: Tensor, saved: Any) -> None:
 
 
 def load_optimizer(optimizer: torch.optim.Optimizer, state_dict: Any) -> None:
-    """Restore an optimiser, and refuse moments of other shapes than their parameters.
+    """Restore an optimiser; a ValueError refuses moments of other shapes than their parameters.
 
     Torch does not compare them, so the first step would fail instead.
-
-    Raises:
-        ValueError: If a shape differs, or torch refuses the state.
     """
     optimizer.load_state_dict(state_dict)
     if not isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW | torch.optim.SGD):

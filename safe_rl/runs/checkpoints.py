@@ -26,29 +26,20 @@ from safe_rl.runs.identity import flatten
 
 
 def read_facts(path: Path) -> dict[str, Any]:
-    """The facts that a checkpoint was written with, without reading its tensors.
-
-    Raises:
-        CheckpointError: If the file is no checkpoint.
-    """
+    """The facts that a checkpoint was written with, without reading its tensors."""
     return _read(path, lazy=True)["facts"]
 
 
 def read_states(path: Path, names: Collection[str] | None = None) -> dict[str, Any]:
-    """States of parts by name: tensors, numbers and plain containers.
-
-    Args:
-        path: The checkpoint.
-        names: Names of the parts to read; None: all.
+    """States of parts by name, all or those of `names`: tensors, numbers and plain containers.
 
     Raises:
         CheckpointError: If the file is no checkpoint, is damaged, or lacks a part.
     """
     parts = _read(path)["parts"]
-    names = parts.keys() if names is None else names
-    if missing := sorted(set(names) - set(parts)):
+    if missing := sorted(set(names or ()) - set(parts)):
         raise CheckpointError(f"The checkpoint {path} has no {' and no '.join(missing)}.")
-    return {name: parts[name] for name in names}
+    return {name: parts[name] for name in (parts if names is None else names)}
 
 
 def policy_hash(path: Path) -> str:
@@ -75,18 +66,15 @@ class HeldCheckpoint(PosixPath):
 
 
 def hold(path: Path) -> HeldCheckpoint:
-    """Open a checkpoint for all later reading.
-
-    Raises:
-        CheckpointError: If the file is no checkpoint, or is damaged.
-    """
-    _read(path)  # checked
+    """Open a checkpoint for all later reading, after a check that it is not damaged."""
+    _read(path)
     held = HeldCheckpoint(path)
     held.content = _read(path, lazy=True)
     return held
 
 
 def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
+    """The content of a checkpoint; a CheckpointError says what is wrong with the file."""
     if isinstance(path, HeldCheckpoint):
         return path.content
     try:
@@ -103,10 +91,7 @@ def check_interface(path: Path, interface: Mapping[str, Any]) -> None:
     """Refuse a checkpoint whose policy was trained on other observations of the same size.
 
     If it says nothing of them, it is not checked. The `interface` is that of the environment in
-    which the policy is to act.
-
-    Raises:
-        CheckpointError: If names of columns or kinds of sensors differ; the message says which.
+    which the policy is to act. A CheckpointError says which columns or sensors differ.
     """
     known = read_facts(path).get("interface")
     if not isinstance(known, dict):
@@ -199,16 +184,7 @@ class CheckpointStore:
         """Write a checkpoint if fewer than ``keep_best`` exist or ``score`` is above a kept one's.
 
         A replaced checkpoint stays until the next `save`: until then, the run would be resumed from
-        a time before the new one.
-
-        Args:
-            steps: Environment steps of the policy.
-            score: Score by which the best checkpoints are chosen.
-            facts: As in `save`.
-            states: States of parts by name; None: the present states.
-
-        Returns:
-            Whether it was written.
+        a time before the new one. `states` are those of parts by name; None: the present ones.
         """
         scores = sorted(filter(math.isfinite, map(_score, checkpoints_in(self.best))))
         if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
@@ -252,17 +228,12 @@ class CheckpointStore:
     def resume(self, epochs: int = 0) -> Path | None:
         """Restore the newest checkpoint; if it is damaged, an older one with a warning.
 
-        Best checkpoints newer than the restored one are removed.
-
-        Args:
-            epochs: Rows of the run's table.
-
-        Returns:
-            The checkpoint, or None if the run was stopped before it had written one.
+        Best checkpoints newer than the restored one are removed. None is returned if the run was
+        stopped before it had written one.
 
         Raises:
             CheckpointError: If no checkpoint can be used (the message is about the newest), or if
-                the run has finished epochs and its checkpoints are missing.
+                the run has finished epochs, rows of its table, and its checkpoints are missing.
         """
         failures: list[CheckpointError] = []
         restored = None
@@ -296,10 +267,8 @@ class CheckpointStore:
     ) -> None:
         """Restore ``components`` from a checkpoint, which may have further parts.
 
-        Args:
-            path: The file.
-            components: Parts by name; all are read before the first is changed.
-            run: Facts that must be equal to those in the checkpoint, if it has them.
+        All are read before the first is changed. Facts of the ``run`` must be equal to those in the
+        checkpoint, if it has them.
 
         Raises:
             CheckpointError: If the file is no checkpoint, does not fit the components, or is

@@ -260,12 +260,9 @@ def config_dirs(notes: Any) -> list[str]:
 
 
 def repeating(overrides: Sequence[str], folders: Iterable[str], frames: int | None = None) -> str:
-    """The command that repeats a run.
+    """The command that repeats a run: from Hydra's notes, and the folders of ``--config-dir``.
 
-    Args:
-        overrides: Overrides that Hydra has noted.
-        folders: Folders of ``--config-dir``.
-        frames: The number of frames, if a run was continued to more than the overrides say.
+    `frames` is given if the run was continued to more than the overrides say.
 
     Examples:
         >>> words = ["import=['my_gym.py','mine']", "cost_limits={cost: 5}"]

@@ -174,11 +174,7 @@ class Run:
         return max(0, lines - 1)
 
     def check_is_run(self) -> None:
-        """Refuse a folder that is not a run's.
-
-        Raises:
-            FileNotFoundError: If it is not; the message names runs below the folder.
-        """
+        """Refuse a folder that is not a run's by a FileNotFoundError, which names runs below it."""
         if self.is_run:
             return
         # of a home, or of a whole disk, a search would take minutes

@@ -103,9 +103,6 @@ def build_trainer(
         directory: Folder of the run.
         make_env: Makes an environment like ``env`` with another ``num_envs``, for workers.
         make_evaluation: Makes the periodic evaluation of the policy; None: there is none.
-
-    Raises:
-        ValueError: If parts of the configuration do not fit together.
     """
     cost_limits = check_cost_limits(config.cost_limits, env.cost_keys)
     algorithm = find_algorithm(config).from_config(config, env)
@@ -155,16 +152,13 @@ def begin_from(
 
     Optimisers, multipliers and counters start anew. Cost networks get the other run's weights only
     if that run had the same constrained costs, the same risk measure and, with Q functions, the
-    same loss.
+    same loss. The names of the networks that were loaded are returned.
 
     Args:
         algorithm: The algorithm of the new run.
         config: Its configuration. ``init_from`` is a checkpoint, or the folder of a run, whose
             newest checkpoint is read.
         interface: ``interface`` of the new run's environment; None: it is not compared.
-
-    Returns:
-        Names of the networks that were loaded.
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other

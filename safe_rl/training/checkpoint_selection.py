@@ -64,11 +64,7 @@ class CheckpointSelection(Resumable):
         self.waiting: list[dict[str, Any]] = []
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the waiting policies.
-
-        Raises:
-            ValueError: If one lacks its steps, its epoch or its states.
-        """
+        """Restore the waiting policies; ValueError if one lacks its steps, epoch or states."""
         super().load_state_dict(state_dict)
         kinds = {"steps": int, "epoch": int, "states": dict}
         for policy in self.waiting:
@@ -78,10 +74,7 @@ class CheckpointSelection(Resumable):
                 )
 
     def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
-        """Add an epoch, and score the waiting policy whose epochs are complete.
-
-        Args:
-            row: Of the run's table, by column.
+        """Add an epoch, a row of the table, and score the waiting policy whose epochs are complete.
 
         Returns:
             Keyword arguments of `CheckpointStore.save_best` for the policy, if it kept every limit.

@@ -75,10 +75,6 @@ class EnvSnapshot:
     Every epoch restores a snapshot, also in a run that is not resumed. The reason: restoring a
     state changes things that snapshots do not have (it wakes sleeping bodies). If only resumed runs
     did this, they would differ from uninterrupted runs.
-
-    Args:
-        env: Environment with ``get_state`` and ``set_state``.
-        collector: The in-process collector that steps it.
     """
 
     def __init__(self, env: EnvBase, collector: Collector) -> None:

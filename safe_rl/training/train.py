@@ -73,13 +73,9 @@ def train(
         directory: Folder of the run.
         hydra: Hydra's settings, for the notes of a new run.
         continues: Whether to continue the run in the folder, or to begin it if there is none.
-        callbacks: Called after every epoch with its row of the table; one that returns False ends
-            the run.
+        callbacks: See `Callback`.
         program: The command, as the user has called it; None: Python, where the outcome is not
             printed.
-
-    Returns:
-        The run.
 
     Raises:
         SystemExit: If a signal has ended the run; the status is 128 and the signal's number.
@@ -90,7 +86,7 @@ def train(
     run, say = Run(directory), print_line if program else lambda line: None
     complete(config, run)
     again = _command_again(run, config, program)
-    with _named_memory(config), _removed_unless_begun(run), lock_folder(run.lock_file):
+    with _ending_cleanly(run, config), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has its {config.frames:,} frames already"
             print(f"{done}: raise 'frames' to train on.")
@@ -135,33 +131,24 @@ def _command_again(run: Run, config: DictConfig, program: str | None) -> str:
 
 
 @contextmanager
-def _removed_unless_begun(run: Run) -> Iterator[None]:
-    """Remove a new folder, or one that Hydra has made, if the run in it cannot begin."""
+def _ending_cleanly(run: Run, config: DictConfig) -> Iterator[None]:
+    """Remove a new folder if its run cannot begin, and name the settings that need memory."""
     is_new = not run.directory.exists() or not any(run.directory.iterdir())
     try:
         yield
     except RunInUseError:
-        raise  # another process has made it in the meantime
-    except BaseException:
+        raise  # another process has made the folder in the meantime
+    except BaseException as error:
         if is_new and not run.has_begun:
             shutil.rmtree(run.directory, ignore_errors=True)
-        raise
-
-
-@contextmanager
-def _named_memory(config: DictConfig) -> Iterator[None]:
-    """Name the settings that need memory, where there is not enough of it."""
-    try:
-        yield
-    except Exception as error:
         # torch raises a RuntimeError for main memory
         is_short = isinstance(error, MemoryError | torch.OutOfMemoryError)
-        if not (is_short or re.search("allocat.* memory", str(error))):
-            raise
-        raise MemoryError(
-            f"There is not enough memory with frames_per_batch={config.frames_per_batch}, "
-            f"num_envs={config.num_envs} and these networks: lower them."
-        ) from error
+        if is_short or re.search("allocat.* memory", str(error)):
+            raise MemoryError(
+                f"There is not enough memory with frames_per_batch={config.frames_per_batch}, "
+                f"num_envs={config.num_envs} and these networks: lower them."
+            ) from error
+        raise
 
 
 def _check_is_free(run: Run, again: str, key: str) -> None:
@@ -251,18 +238,9 @@ def certify_finished(
 ) -> None:
     """Certify a finished run that is to keep limits, unless it is short or tested already.
 
-    A tested one is tested again if the configuration has other options for the test.
-
-    Args:
-        run: The run.
-        config: Its configuration.
-        length: T_ep, steps of a full episode.
-        stopped_by: The signal that has come in the last epoch: it ends the process before the test.
-        again: The command that continues the run.
-        say: Prints a line.
-
-    Raises:
-        SystemExit: If a signal has come, or comes during the test.
+    A tested one is tested again if the configuration has other options for the test. `length` is
+    T_ep, steps of a full episode. `stopped_by`, a signal that has come in the last epoch, ends the
+    process before the test. `again` is the command that continues the run; `say` prints a line.
     """
     # steps of a test that stops early, after a fifth of its episodes
     steps = int(config.certificate.episodes * length / 5)
@@ -301,11 +279,7 @@ def import_words(config: DictConfig) -> str:
 
 
 def end_by(signal: Signals | None, line: str) -> None:
-    """End the process if a signal asks for it, with a line about how to go on.
-
-    Raises:
-        SystemExit: If there is a signal; the status is 128 and its number.
-    """
+    """End the process if a signal asks for it, with a line about how to go on."""
     if signal is not None:
         print_line(line)
         raise SystemExit(128 + signal)

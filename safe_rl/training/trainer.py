@@ -119,10 +119,7 @@ class Trainer:
         )
 
     def resume(self) -> bool:
-        """Continue the run in the folder from its newest checkpoint, if there is one.
-
-        Returns:
-            Whether there was a checkpoint.
+        """Continue the run in the folder from its newest checkpoint; return whether there is one.
 
         Raises:
             CheckpointError: If no checkpoint can be read, or they do not fit this run.
@@ -159,10 +156,7 @@ class Trainer:
         """Train for ``frames`` steps, rounded up to whole batches.
 
         Ctrl-C, SIGTERM or SIGHUP ends the run after the current epoch, with a checkpoint. Then
-        ``stopped_by`` is the signal.
-
-        Returns:
-            One line about the outcome.
+        ``stopped_by`` is the signal. One line about the outcome is returned.
         """
         try:
             self._train()
@@ -216,11 +210,7 @@ class Trainer:
             self._save()
 
     def epoch(self, batches: Iterator[TensorDictBase]) -> dict[str, float]:
-        """Collect a batch [N, T] and learn from it; return the row of the table.
-
-        Args:
-            batches: The endless batches of ``collector``.
-        """
+        """Collect a batch [N, T] and learn from it; return the row of the table."""
         start = time.perf_counter()
         # One observation per environment is too little work for several threads, and the physics
         # needs the cores.
