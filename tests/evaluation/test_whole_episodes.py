@@ -66,8 +66,9 @@ def test_every_world_contributes_its_first_episodes(number, expected):
 
 @pytest.mark.parametrize("keys", itertools.permutations(["cost", "cost_hazards", "cost_boundary"]))
 def test_costs_keep_their_names_in_any_order(keys):
-    changes = {"num_steps": 20, "hazards_size": 2.0, "constrain_boundary": True, "boundary_x": 0.001}
-    env = make_env("PointGoal1", num_envs=1, seed=0, constrain_indicator=False, **changes)
+    changes = {"num_steps": 20, "hazards_size": 2.0, "constrain_boundary": True}
+    changes |= {"boundary_x": 0.001, "constrain_indicator": False}
+    env = make_env("PointGoal1", num_envs=1, seed=0, **changes)
     sums = dict.fromkeys(keys, 0.0)
 
     def add(step):
