@@ -1,4 +1,4 @@
-"""Files of a run: read without trusting them, written atomically. Any may raise an OSError.
+"""Files of a run: read without trusting them, written atomically. All functions may raise OSError.
 
 This is directly in ``safe_rl/``, because several folders write files of a run.
 """
@@ -272,7 +272,7 @@ def check_no_links(folder: Path) -> None:
 
 
 def check_place(path: Path, otherwise: str) -> None:
-    """Raise an OSError, which ends with an advice, if a file and its folders cannot be written."""
+    """Raise an OSError, which ends with the advice `otherwise`, if a file cannot be written."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder, where a file is to be written. {otherwise}")
     above = next(folder for folder in path.parents if folder.exists())

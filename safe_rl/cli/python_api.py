@@ -95,13 +95,17 @@ def train(
         )
     if "resume" in settings:
         raise ValueError("safe_rl.resume(directory) continues a run.")
+    if directory == "":
+        raise ValueError("directory=… names the folder of the run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = [imports] if isinstance(imports, str) else list(imports)
     import_modules(modules)
     more = {"import": modules} if modules else {}
     config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
+    if any(word.lstrip("+~").startswith("hydra.run") for word in config.hydra.overrides.hydra):
+        raise ValueError("hydra.run.dir: in Python directory=… names the folder of the run.")
     check_settings(config)
-    folder = directory or new_folder(Path(config.hydra.run.dir))
+    folder = new_folder(Path(config.hydra.run.dir)) if directory is None else directory
     return _carry_out(config, Path(folder).expanduser(), callbacks)
 
 

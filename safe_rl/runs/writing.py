@@ -68,11 +68,18 @@ class RunWriter:
 
     def _make_logger(self) -> Any:
         try:
-            return instantiate(self.config.get("logger"), log_dir=str(self.run.directory))
+            logger = instantiate(self.config.get("logger"), log_dir=str(self.run.directory))
         except (SettingError, OSError):
             raise
         except Exception as error:  # those of the services have types of their own
             raise SettingError(f"logger: {' '.join(str(error).split())}") from error
+        for name in ("log_scalar", "log_hparams", "close"):
+            if logger is not None and not callable(getattr(logger, name, None)):
+                raise SettingError(
+                    f"logger._target_={self.config.logger._target_}: it has no '{name}'. Derive a "
+                    "logger of yours from torchrl.record.loggers.Logger."
+                )
+        return logger
 
     def _save_config(self) -> None:
         if not self._is_config_saved:

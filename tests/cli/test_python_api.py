@@ -138,6 +138,15 @@ def test_errors_name_the_setting(settings, message, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_folder_is_named_by_directory_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    given = ("hydra.run.dir", "mine"), ("++hydra.run.dir", "mine"), ("hydra", {"run": {"dir": ""}})
+    for settings in ({"directory": ""}, *({key: value} for key, value in given)):
+        with pytest.raises(ValueError, match="names the folder of the run"):
+            safe_rl.train(**settings)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_folders_of_ones_own_one_or_several(tmp_path):
     folders = [tmp_path / "first, with a comma", tmp_path / "second"]
     head = "# @package _global_\ndefaults: [ppo_lagrangian, _self_]\n"

@@ -72,13 +72,23 @@ def test_a_logger_of_ones_own_needs_only_to_log(tmp_path):
     assert sorted(set(Scalars.steps)) == [160, 320]
 
 
-class Refused:
+class Mute:
+    """What logs nothing."""
+
+    def __init__(self, log_dir):
+        pass
+
+
+class Refused(Mute):
     def __init__(self, log_dir):
         raise Exception("unknown\nuri")
 
 
-def test_a_logger_that_cannot_log_is_refused_before_the_run_begins(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "words"), [("Mute", "it has no 'log_scalar'"), ("Refused", "^logger: unknown uri$")]
+)
+def test_a_logger_that_cannot_log_is_refused_before_the_run_begins(name, words, tmp_path):
     allow(__name__)
-    with pytest.raises(SettingError, match=r"^logger: unknown uri$"):
-        train(tmp_path / "run", f"logger._target_={__name__}.Refused", "frames=160")
+    with pytest.raises(SettingError, match=words):
+        train(tmp_path / "run", f"logger._target_={__name__}.{name}", "frames=160")
     assert not (tmp_path / "run" / "progress.csv").exists()
