@@ -234,11 +234,16 @@ def read_evaluation(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_code(content: Sequence[Mapping[str, Any]]) -> str:
-    """The version and commit of a run's code; of later ones, also the steps at which they began."""
+    """The version of a run's code, and commits, also of the user's modules.
+
+    Of later ones also the steps at which they began.
+    """
     parts = []
     for entry in content[:9]:
-        words = [clean(entry["version"], 20), clean(entry["commit"] or "")[:10]]
-        words += ["with changes"] if entry["changed"] else []
+        words = [clean(entry["version"], 20)]
+        for name, code in {"": entry, **entry.get("imports", {})}.items():
+            words += [clean(name), clean(code["commit"] or "")[:10]]
+            words += ["with changes"] if code["changed"] else []
         words += [f"from {int(entry['steps']):,} steps on"] if entry["steps"] else []
         parts.append(" ".join(filter(None, words)))
     return "; ".join(parts)

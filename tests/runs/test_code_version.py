@@ -2,10 +2,13 @@
 
 import json
 import subprocess
+import sys
+from types import SimpleNamespace
 
 import pytest
 
 import safe_rl
+from safe_rl.reporting.tables import read_code
 from safe_rl.runs import code_version
 from safe_rl.runs.code_version import code_of, note_code
 from safe_rl.runs.run import Run
@@ -34,7 +37,7 @@ def checkout(tmp_path, monkeypatch):
 
 def test_the_commit_is_gits_and_a_change_is_told(checkout):
     module, git = checkout
-    commit = {"version": safe_rl.__version__, "commit": git("rev-parse", "HEAD")}
+    commit = {"commit": git("rev-parse", "HEAD")}
     assert code_of(module) == commit | {"changed": False}
     (module.parent / "notes.txt").write_text("not under version control")
     code_of.cache_clear()
@@ -59,8 +62,27 @@ def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
     assert (known["commit"], known["changed"]) == (None, None)
 
 
+def test_the_commits_of_the_users_modules_are_noted(checkout, tmp_path, monkeypatch):
+    module, git = checkout
+    monkeypatch.setitem(sys.modules, "theirs", SimpleNamespace(__file__=str(module)))
+    monkeypatch.setattr(code_version, "allowed", lambda: ["theirs"])
+    path = tmp_path / "code.json"
+    note_code(path, 0)
+    (entry,) = json.loads(path.read_text())
+    commit = git("rev-parse", "HEAD")
+    assert entry["imports"] == {"theirs": {"commit": commit, "changed": False}}
+    module.write_text("x = 2\n")
+    code_of.cache_clear()
+    note_code(path, 100)  # continued after a change
+    first, second = json.loads(path.read_text())
+    assert (first, second["steps"]) == (entry, 100)
+    assert second["imports"]["theirs"]["changed"] is True
+    assert read_code([second]).endswith(f"theirs {commit[:10]} with changes from 100 steps on")
+
+
 def test_without_git_a_run_is_noted_all_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(code_version, "allowed", list)  # not the modules of other tests
     code_of.cache_clear()
     note_code(tmp_path / "code.json", 0)
     code_of.cache_clear()
