@@ -3,8 +3,8 @@
 - `QuadraticPenaltyLoss` is PPO's loss plus a penalty: the square of the amount by which the
   predicted J_c exceeds its target. `self.limits` is the state of the limits after the last batch.
 - `UpperSemideviation` limits E[C] + w E[(C − E[C])₊], the mean cost of an episode plus w times the
-  mean excess of costly episodes (Ruszczyński and Shapiro 2006). It computes a penalised
-  cost of each step, which replaces its cost for advantages, critics and limits.
+  mean excess of costly episodes (Ruszczyński and Shapiro 2006). It computes a measured
+  cost of each step, which replaces its cost where the limit is compared.
 
 The files in `conf/` beside this one name these classes:
 
@@ -21,7 +21,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.objectives import PPOLoss, RiskMeasure
-from safe_rl.objectives.risk import PenalisedCosts, cost_so_far
+from safe_rl.objectives.risk import MeasuredCosts, cost_so_far
 
 
 class QuadraticPenaltyLoss(PPOLoss):
@@ -43,7 +43,7 @@ class QuadraticPenaltyLoss(PPOLoss):
 
 
 class UpperSemideviation(RiskMeasure):
-    """Penalised costs of mean E[C] + w E[(C − m)₊], m the running mean of C."""
+    """Measured costs of mean E[C] + w E[(C − m)₊], m the running mean of C."""
 
     state_names = ("_mean",)  # what checkpoints keep of it
 
@@ -53,12 +53,12 @@ class UpperSemideviation(RiskMeasure):
 
     def __call__(
         self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
-    ) -> PenalisedCosts:
-        """Compute the penalised costs of a batch: see `safe_rl.objectives.RiskMeasure`."""
+    ) -> MeasuredCosts:
+        """Compute the measured costs of a batch: see `safe_rl.objectives.RiskMeasure`."""
         if len(finished):
             mean = finished.float().mean(0)
             known = self._mean.isfinite()
             self._mean = torch.where(known, torch.lerp(mean, self._mean, self.decay), mean)
         beyond = (cost_so_far(costs, ends, before) - self._mean).clamp_min(0)
-        penalised = costs + self.weight * torch.minimum(costs, beyond)
-        return PenalisedCosts(penalised, offset=torch.zeros_like(self.limits), limit=self.limits)
+        measured = costs + self.weight * torch.minimum(costs, beyond)
+        return MeasuredCosts(measured, offset=torch.zeros_like(self.limits), limit=self.limits)

@@ -16,12 +16,9 @@ from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitState, LimitTracker
 from safe_rl.objectives.multipliers import Multiplier, parse_cost_limits
-from safe_rl.objectives.risk import PenalisedCosts, RiskMeasure
+from safe_rl.objectives.risk import MeasuredCosts, RiskMeasure
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
-
-PENALISED_COSTS = "penalised_costs"
-"""Key below ``"next"``, [N, T, k], of what a risk measure puts in place of the costs."""
 
 
 class Constraints(Resumable):
@@ -80,13 +77,12 @@ class Constraints(Resumable):
         self.state_names = ("finished", "mean_length") if tracker is None else ("tracker",)
         if risk is not None:
             self.state_names = ("tracker", "risk")
-        stages = [part.schedule for part in (tracker, risk) if part is not None and self.keys]
-        self.schedule = " ".join(filter(None, stages))
+        self.schedule = tracker.schedule if tracker is not None and self.keys else ""
         self._max_length = max_length
         # mean costs and length of episodes in the last batch in which an episode finished
         self.finished = torch.full_like(self.limits, torch.nan)
         self.mean_length = torch.full((), torch.nan, device=device)
-        self._penalised: PenalisedCosts | None = None
+        self._measured: MeasuredCosts | None = None
 
     @classmethod
     def from_config(cls, config: DictConfig, env: EnvBase) -> Self:
@@ -110,7 +106,7 @@ class Constraints(Resumable):
             return cls({}, max_length=max_length, device=config.device)
         values = torch.tensor(list(limits.values()))
         known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
-        risk = instantiate(config.get("risk"), known, cost_limits=values)
+        risk = instantiate(config.get("risk"), cost_limits=values)
         tracker = instantiate(config.get("limits"), known, cost_limits=values)
         return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
 
@@ -121,9 +117,7 @@ class Constraints(Resumable):
         return dict(zip(self.keys, limits.tolist(), strict=True))
 
     def update(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> LimitState:
-        """Measure costs and violations from a batch, before advantages are estimated.
-
-        A risk measure writes `PENALISED_COSTS` into the batch: estimate cost advantages from them.
+        """Measure costs and violations from a batch, before the policy is updated.
 
         Args:
             batch: Steps of the current policy, [N, T], in order of time.
@@ -142,8 +136,11 @@ class Constraints(Resumable):
             return self._compare_episodes(batch, episodes)
         costs = torch.cat([batch["next", key] for key in self.keys], -1)
         if self.risk is not None:
-            self._penalise(batch, costs.cpu(), episodes)
-        state = self.tracker.update(costs, episodes.decisions, self._penalised)
+            ends = batch["next", "done"].squeeze(-1).cpu()
+            before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
+            finished = episodes.episode_costs(self.keys).cpu()
+            self._measured = self.risk(costs.cpu(), ends, before.cpu().to(costs.dtype), finished)
+        state = self.tracker.update(costs, episodes.decisions, self._measured)
         return state.to(self.limits)
 
     def _compare_episodes(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> LimitState:
@@ -167,16 +164,6 @@ class Constraints(Resumable):
         is_new = goes_by_rate or episodes.num_episodes > 0
         return LimitState.of(cost=costs, limit=self.limits, length=length, is_new=is_new)
 
-    def _penalise(self, batch: TensorDictBase, costs: Tensor, episodes: EpisodeStatistics) -> None:
-        """Write what the risk measure makes of the costs [N, T, k] below ``"next"``."""
-        assert self.risk is not None
-        ends = batch["next", "done"].squeeze(-1).cpu()
-        before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
-        finished = episodes.episode_costs(self.keys).cpu()
-        self._penalised = self.risk(costs, ends, before.to(costs), finished)
-        device = batch.device or self.limits.device
-        batch["next", PENALISED_COSTS] = self._penalised.costs.to(device)
-
     def record_prediction(self, state: LimitState, metrics: Mapping[str, Tensor]) -> None:
         """Store the change of J_c that an update's surrogates predict, if it reports them."""
         if self.tracker is not None and "cost_surrogate" in metrics:
@@ -189,8 +176,8 @@ class Constraints(Resumable):
             row = self.column("violation", state.violation)
         else:
             row = self.column("estimate", state.cost) | self.column("target", state.target)
-        if self._penalised is not None:
-            limit = self._penalised.limit.to(state.cost)
+        if self._measured is not None:
+            limit = self._measured.limit.to(state.cost)
             row |= self.column("violation", state.cost - limit)
         if multiplier is not None:
             row |= self.column("multiplier", multiplier.value)

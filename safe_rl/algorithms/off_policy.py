@@ -23,7 +23,6 @@ from safe_rl.models import ExploringPolicy, QEnsemble
 from safe_rl.models.build_networks import Codes, Observed, observed_by, observed_entries
 from safe_rl.models.replay_networks import bounded_actions
 from safe_rl.objectives import CostValues, MeanCosts, Multiplier
-from safe_rl.objectives.q_functions import ReplayLoss
 from safe_rl.resumable import Resumable
 from safe_rl.trust import instantiate
 
@@ -67,7 +66,7 @@ class OffPolicy(Resumable, Algorithm):
             FileNotFoundError: If there is no such dataset.
         """
         device, constraints = torch.device(config.device), Constraints.from_config(config, env)
-        limits = constraints.cost_limits
+        limits = constraints.measured_limits
         multiplier = instantiate(config.get("lagrangian"), cost_limits=limits)
         if multiplier is not None:
             multiplier.to(device)
@@ -88,7 +87,6 @@ class OffPolicy(Resumable, Algorithm):
             actor_network=networks["actor"],
         )
         update = instantiate(config.policy_update, loss=loss)
-        _check_loss(config, constraints, loss)
         buffer = instantiate(
             config.memory,
             in_keys=loss.in_keys,
@@ -206,19 +204,6 @@ def _check_room(buffer: Memory, random_steps: int, collects: bool) -> None:
             f"memory.capacity={buffer.capacity}: it must hold "
             f"exploration.random_steps={random_steps} transitions and {needed}"
         )
-
-
-def _check_loss(config: DictConfig, constraints: Constraints, loss: ReplayLoss) -> None:
-    """Refuse a risk measure that the critics do not support."""
-    risk, known = constraints.risk, loss.risk_measure
-    if risk is None or (known is not None and isinstance(risk, known)):
-        return
-    limited = "mean costs" if known is None else f"mean costs or {known.__name__}"
-    raise ValueError(
-        f"risk: algo={config.algo.name} limits {limited} only, because its replay buffer holds "
-        "single steps and other risk measures need whole episodes. Use risk=mean, algo=wcsac with "
-        "risk=cvar, or an on-policy algorithm such as algo=ppo_lagrangian."
-    )
 
 
 def exploring_policy(actor: TensorDictModuleBase, env: EnvBase, noise: float) -> ExploringPolicy:

@@ -20,7 +20,7 @@ from safe_rl.algorithms.algorithm_contract import (
     Stateful,
     networks_of_target,
 )
-from safe_rl.algorithms.constraints import PENALISED_COSTS, Constraints
+from safe_rl.algorithms.constraints import Constraints
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
@@ -88,8 +88,6 @@ class OnPolicy(Algorithm):
                     f"algo={config.algo.name} is constrained and has no cost_advantage."
                 )
             cost_advantage = instantiate(node, optional, value_network=cost_critic)
-            if constraints.risk is not None:
-                cost_advantage.set_keys(reward=[PENALISED_COSTS])
         loss = instantiate(config.loss, optional, actor_network=networks["actor"])
         return cls(
             **{"cost_critic": None, **networks},

@@ -83,7 +83,6 @@ class CostCritics(QFunctionLoss):
         device = next(cost_qvalue_network.parameters()).device
         check_ensemble(cost_qvalue_network, "cost critic")
         self.cost_values = MeanCosts() if cost_values is None else cost_values
-        self.risk_measure = self.cost_values.risk_measure
         # the base's constructor makes in_keys of these
         self.cost_keys, self._read = list(cost_keys), list(cost_qvalue_network.in_keys[:-1])
         if multiplier.num_costs != len(self.cost_keys):

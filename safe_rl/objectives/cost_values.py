@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.nn.functional import mse_loss, softplus
 
 from safe_rl.checks import Checked, Fraction
-from safe_rl.objectives.risk import CVaR
 
 _SMALLEST = 1e-8
 """Lower bound of variances, so that their root has a finite slope, as in the published code."""
@@ -37,13 +36,11 @@ class CostValues(Checked, ABC):
     Attributes:
         networks: Perceptrons per critic; n is ``networks * outputs``.
         outputs: Numbers per cost and perceptron.
-        risk_measure: Class of risk measure that they estimate; None for means only.
         columns: Names of diagnostics besides ``cost_qvalue``.
     """
 
     networks: int = 1
     outputs: int = 1
-    risk_measure: type | None = None
     columns: ClassVar[tuple[str, ...]] = ()
 
     def arranged(self, values: Tensor, num_costs: int) -> Tensor:
@@ -127,7 +124,6 @@ class GaussianCosts(CostValues):
     """
 
     networks = 2
-    risk_measure = CVaR
     columns = ("cost_deviation",)
 
     def __init__(self, *, tail: Fraction) -> None:
@@ -208,7 +204,6 @@ class QuantileCosts(CostValues):
         huber: PositiveFloat,
     ) -> None:
         self.outputs, self.tail, self.huber = number, tail, huber
-        self.risk_measure = CVaR if tail < 1 else None
 
     def mean(self, values: Tensor) -> Tensor:
         """The mean of the quantiles."""

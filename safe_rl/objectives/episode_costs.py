@@ -19,7 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from safe_rl.objectives.risk import PenalisedCosts
+from safe_rl.objectives.risk import MeasuredCosts
 from safe_rl.resumable import Resumable
 
 #: Number of ends of episodes over which the mean length is computed.
@@ -153,22 +153,22 @@ class EpisodeCosts(Resumable):
         return CostEstimate(self._mean, self._error)
 
     def update(
-        self, costs: Tensor, lengths: Tensor, penalised: PenalisedCosts | None = None
+        self, costs: Tensor, lengths: Tensor, measured: MeasuredCosts | None = None
     ) -> CostEstimate:
         """Update the estimate with a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k].
             lengths: Steps of every episode that finished in it, [E].
-            penalised: Costs of a risk measure, which are estimated instead; `unit` ignores them.
+            measured: Costs of a risk measure, which are estimated instead; `unit` ignores them.
         """
         costs = costs.to(self._sums)
         self._sums += torch.stack([costs.sum((0, 1)), costs.square().sum((0, 1))])
         self.lengths.update(costs.shape[0] * costs.shape[1], lengths)
-        limited = costs if penalised is None else penalised.costs.to(costs)
+        limited = costs if measured is None else measured.costs.to(costs)
         batch = CostEstimate(*(each.float() for each in rate_estimate(limited, self.lengths.mean)))
-        if penalised is not None:
-            batch = batch._replace(mean=batch.mean + penalised.offset)
+        if measured is not None:
+            batch = batch._replace(mean=batch.mean + measured.offset)
         self.batch = batch
         if self.drift is not None:
             size = self.scale(self.estimate.mean)

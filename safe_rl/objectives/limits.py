@@ -18,7 +18,7 @@ from torch import Tensor
 
 from safe_rl.checks import Checked, Fraction, Share, Weight
 from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts
-from safe_rl.objectives.risk import PenalisedCosts
+from safe_rl.objectives.risk import MeasuredCosts
 from safe_rl.resumable import Resumable
 
 
@@ -269,13 +269,13 @@ class LimitTracker(Checked, Resumable):
 
     @torch.no_grad()
     def update(
-        self, costs: Tensor, lengths: Tensor, penalised: PenalisedCosts | None = None
+        self, costs: Tensor, lengths: Tensor, measured: MeasuredCosts | None = None
     ) -> LimitState:
         """Update estimates and targets with a batch; arguments as of `EpisodeCosts.update`."""
         costs, lengths = costs.detach().cpu(), lengths.detach().cpu()
-        estimate = self.costs.update(costs, lengths, penalised)
-        if penalised is not None:
-            self.limits = penalised.limit
+        estimate = self.costs.update(costs, lengths, measured)
+        if measured is not None:
+            self.limits = measured.limit
         batch = self.costs.batch
         scale = self.costs.scale(self.limits)
         self.predictions.update(batch.mean, prior=0.5 * scale)

@@ -46,13 +46,7 @@ def check_ensemble(network: Any, what: str) -> None:
 
 
 class ReplayLoss(Checked, SharesTensors):
-    """Interface of losses on steps from a replay buffer, for off-policy algorithms.
-
-    Attributes:
-        risk_measure: Class of risk measure that the cost critics estimate; None for means only.
-    """
-
-    risk_measure: type | None = None
+    """Interface of losses on steps from a replay buffer, for off-policy algorithms."""
 
     def target_pairs(self) -> list[tuple[Tensor, Tensor]]:
         """Pairs of tensors: of a target network, and of the network that it follows.

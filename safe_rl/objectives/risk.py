@@ -1,12 +1,14 @@
 """Limits on other measures than the mean: CVaR, and the share of episodes above a limit.
 
 With a limit d on the mean cost, a third to a half of the episodes cost more than d. A risk measure
-replaces the costs of steps by *penalised costs*. The mean over episodes of their sum is the
-measure, up to an offset that does not depend on the policy to first order. So everything that keeps
-a limit on a mean (critics, advantages, multipliers, steps, the descent of the limit) also keeps a
-limit on the measure.
+replaces the costs of steps by *measured costs*. The mean over episodes of their sum is the measure,
+up to an offset. So the estimates of J_c, the target and the multiplier are those of the measure.
 
-A step has a penalised cost if the cost of its episode up to this step passes a threshold. So the
+The policy learns from the costs themselves: λ rises until the measure is within its limit. The
+gradient of the measure comes from the few steps of its tail. In batches of twenty episodes it is
+noise, by which no run has kept a limit (`docs/transforms.md`, results).
+
+A step has a measured cost if the cost of its episode up to this step passes a threshold. So the
 measure needs the cost of unfinished episodes at the start of a batch, but no batches of whole
 episodes.
 """
@@ -18,15 +20,14 @@ from typing import Annotated, NamedTuple
 
 import torch
 from annotated_types import Interval
-from pydantic import NonNegativeInt
 from torch import Tensor
 
 from safe_rl.checks import Checked, Fraction, Weight
 from safe_rl.resumable import Resumable
 
 
-class PenalisedCosts(NamedTuple):
-    """The values that replace the costs of a batch."""
+class MeasuredCosts(NamedTuple):
+    """The values that replace the costs of a batch where J_c is estimated."""
 
     costs: Tensor  # of its steps, [N, T, k]
     offset: Tensor  # is added to their sum over an episode, [k]
@@ -40,22 +41,20 @@ class RiskMeasure(Checked, Resumable, ABC):
 
     Attributes:
         limits: Limits d, [k].
-        schedule: A sentence on when the measure begins to count; empty if it does from the start.
     """
 
     limits: Tensor
-    schedule: str = ""
 
     @property
     def measured_limits(self) -> Tensor:
-        """Limit of the mean penalised cost of an episode, [k]."""
+        """Limit of the mean measured cost of an episode, [k]."""
         return self.limits
 
     @abstractmethod
     def __call__(
         self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
-    ) -> PenalisedCosts:
-        """Compute the penalised costs of a batch.
+    ) -> MeasuredCosts:
+        """Compute the measured costs of a batch.
 
         Args:
             costs: Costs of its steps, [N, T, k], none negative.
@@ -84,33 +83,28 @@ class CVaR(RiskMeasure):
     """CVaR_α ≤ d: the mean cost of the worst fraction α of the episodes.
 
     With the cost C of an episode, CVaR = ν + E[(C − ν)₊] / α. ν is the value at risk: a fraction α
-    of the episodes costs more (Rockafellar and Uryasev 2000, theorem 1). ν minimises the
-    expression, so its change with the policy has an effect of second order only, and (C − ν)₊ / α
-    has the gradient of the CVaR (Chow, Ghavamzadeh, Janson and Pavone 2017). The penalised cost
-    of a step is the increase of (C − ν)₊ / α by this step.
+    of the episodes costs more (Rockafellar and Uryasev 2000, theorem 1). The measured cost of a
+    step is the increase of (C − ν)₊ / α by this step; until an episode has finished, it is the
+    cost.
 
-    The measure is (1 − κ) E[C] + κ CVaR, where κ rises from 0 to 1: at first, it is the mean. A
-    limit on the CVaR must be higher than one on the mean: on PointGoal1 a policy with a mean of 25
-    has a CVaR of about 60 at α = 0.1.
+    A limit on the CVaR must be higher than one on the mean: the package's policy for PointGoal1
+    has a mean of 24 and, at α = 0.1, a CVaR of 89.
 
     Args:
         cost_limits: Limits d, [k].
         tail: Share α of the episodes, those with the highest costs, whose mean cost is limited.
         window: Number of past episodes from which ν, the value at risk, is estimated.
-        ramp_start: Environment steps at the start during which κ = 0: only the mean is limited.
-        ramp_steps: Environment steps, after ramp_start, during which the CVaR replaces the mean.
-        steps_per_decision: Environment steps per time step of a batch, which is one action.
 
     Examples:
-        >>> risk = CVaR(torch.tensor([50.0]), tail=0.5, window=100, ramp_start=0, ramp_steps=0)
+        >>> risk = CVaR(torch.tensor([50.0]), tail=0.5, window=100)
         >>> costs, ends = torch.ones(2, 3, 1), torch.tensor([[False, False, True]] * 2)
         >>> finished = torch.tensor([[3.0], [13.0]])
-        >>> penalised = risk(costs, ends, torch.tensor([[0.0], [10.0]]), finished)
-        >>> penalised.costs.sum((1, 2)), penalised.offset  # ν = 3
+        >>> measured = risk(costs, ends, torch.tensor([[0.0], [10.0]]), finished)
+        >>> measured.costs.sum((1, 2)), measured.offset  # ν = 3
         (tensor([0., 6.]), tensor([3.]))
     """
 
-    state_names = ("_finished", "_steps")
+    state_names = ("_finished",)
 
     def __init__(
         self,
@@ -118,48 +112,27 @@ class CVaR(RiskMeasure):
         *,
         tail: Fraction,
         window: Annotated[int, Interval(ge=1, le=10**6)],
-        ramp_start: NonNegativeInt,
-        ramp_steps: NonNegativeInt,
-        steps_per_decision: int = 1,
     ) -> None:
         self.limits = cost_limits.detach().cpu().float()
         self.tail, self.window = tail, window
-        self.ramp_start, self.ramp_steps = ramp_start, ramp_steps
-        if end := ramp_start + ramp_steps:
-            self.schedule = (
-                f"Until step {ramp_start:,} the mean is limited; from step {end:,} on the CVaR "
-                "alone (risk.ramp_start, risk.ramp_steps)."
-            )
-        self._steps_per_decision = steps_per_decision
-        self._steps = 0
         self._finished = torch.empty(0, len(self.limits))
-
-    @property
-    def weight(self) -> float:
-        """κ, the weight of the CVaR, in [0, 1]; the mean has the weight 1 − κ."""
-        if not len(self._finished):
-            return 0.0
-        return min(1.0, max(0.0, (self._steps - self.ramp_start) / max(1, self.ramp_steps)))
 
     def __call__(
         self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
-    ) -> PenalisedCosts:
-        """Compute the penalised costs of a batch: see `RiskMeasure`."""
+    ) -> MeasuredCosts:
+        """Compute the measured costs of a batch: see `RiskMeasure`."""
         self._finished = torch.cat([self._finished, finished.float()])[-self.window :]
-        self._steps += ends.numel() * self._steps_per_decision
-        weight = self.weight
-        if not weight:
-            return PenalisedCosts(costs, torch.zeros_like(self.limits), self.limits)
+        if not len(self._finished):
+            return MeasuredCosts(costs, torch.zeros_like(self.limits), self.limits)
         threshold = value_at_risk(self._finished, self.tail)
         beyond = (cost_so_far(costs, ends, before) - threshold).clamp_min(0)
-        tail = torch.minimum(costs, beyond) / self.tail
-        return PenalisedCosts((1 - weight) * costs + weight * tail, weight * threshold, self.limits)
+        return MeasuredCosts(torch.minimum(costs, beyond) / self.tail, threshold, self.limits)
 
 
 class Chance(RiskMeasure):
     """P(C > d) ≤ ε: at most a fraction ε of the episodes costs more than d.
 
-    The step at which an episode's cost passes d has the penalised cost w = max(d, 1), all others 0.
+    The step at which an episode's cost passes d has the measured cost w = max(d, 1), all others 0.
     Their sum over an episode is w 1{C > d}, and the limit of its mean is w ε. With the weight w, λ
     has about the same size as for a limit on the mean cost.
 
@@ -181,15 +154,15 @@ class Chance(RiskMeasure):
 
     @property
     def measured_limits(self) -> Tensor:
-        """Limit of the mean penalised cost of an episode, w ε, [k]."""
+        """Limit of the mean measured cost of an episode, w ε, [k]."""
         return self.weight * self.most_over
 
     def __call__(
         self, costs: Tensor, ends: Tensor, before: Tensor, finished: Tensor
-    ) -> PenalisedCosts:
-        """Compute the penalised costs of a batch: see `RiskMeasure`."""
+    ) -> MeasuredCosts:
+        """Compute the measured costs of a batch: see `RiskMeasure`."""
         over = cost_so_far(costs, ends, before) > self.limits
         was_over = (over & ~ends.unsqueeze(-1)).roll(1, 1)
         was_over[:, 0] = before > self.limits
         crossing = torch.where(over & ~was_over, self.weight, 0.0).to(costs)
-        return PenalisedCosts(crossing, torch.zeros_like(self.limits), self.measured_limits)
+        return MeasuredCosts(crossing, torch.zeros_like(self.limits), self.measured_limits)

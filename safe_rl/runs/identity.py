@@ -94,6 +94,8 @@ _SILENT: dict[str, Hashable] = {
     "model.critic_observes": ("observation",),
     "policy_update.fisher_subsample": 1.0,
     "policy_update.rescale_violation": True,
+    "risk.ramp_start": 0,
+    "risk.ramp_steps": 0,
 }
 
 

@@ -32,15 +32,15 @@ def test_the_penalty_of_a_policy_that_has_not_moved():
     torch.testing.assert_close(losses["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))
 
 
-def test_penalised_costs_sum_to_mean_and_semideviation():
+def test_measured_costs_sum_to_mean_and_semideviation():
     costs = torch.rand(6, 10, 1)
     ends = torch.zeros(6, 10, dtype=torch.bool)
     ends[:, -1] = True
     totals = costs.sum(1)
     risk = custom_loss.UpperSemideviation(torch.tensor([1.0]), weight=0.5, decay=0.0)
-    penalised = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
+    measured = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
     expected = totals.mean() + 0.5 * (totals - totals.mean()).clamp_min(0).mean()
-    torch.testing.assert_close(penalised.mean(), expected)
+    torch.testing.assert_close(measured.mean(), expected)
 
 
 def test_it_trains_with_several_costs(tmp_path):

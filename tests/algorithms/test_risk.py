@@ -2,26 +2,20 @@
 
 import pytest
 import torch
-from point_mass_runs import point_mass_trainer
+from point_mass_runs import point_mass_trainer, trainer_of
+from run_configs import off_policy_config
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 from tensordict import TensorDict
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-from torch import nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from safe_rl.algorithms.constraints import PENALISED_COSTS
 from safe_rl.collectors import EpisodeAccounting
-from safe_rl.objectives import Chance, CostGAE, CVaR, TRPOLoss
+from safe_rl.objectives import Chance, CVaR
 from safe_rl.objectives.risk import cost_so_far
 from safe_rl.runs.table import read_table
 
 
-def cvar_of(limits, tail=0.25, window=10_000, ramp_start=0, ramp_steps=0):
-    return CVaR(
-        torch.tensor(limits), tail=tail, window=window,
-        ramp_start=ramp_start, ramp_steps=ramp_steps,
-    )  # fmt: skip
+def cvar_of(limits, tail=0.25, window=10_000):
+    return CVaR(torch.tensor(limits), tail=tail, window=window)
 
 
 def random_episodes(rows=4, steps=60):
@@ -48,17 +42,17 @@ def totals_of(costs, ends):
 
 
 @pytest.mark.parametrize("tail", [0.1, 0.25, 0.6, 1.0])
-def test_charges_of_cvar_solve_the_program_of_rockafellar_and_uryasev(tail):
+def test_measured_costs_of_cvar_solve_the_program_of_rockafellar_and_uryasev(tail):
     costs, ends = random_episodes()
     finished = totals_of(costs, ends)
-    penalised = cvar_of([50.0, 50.0], tail)(costs, ends, torch.zeros(4, 2), finished)
+    measured = cvar_of([50.0, 50.0], tail)(costs, ends, torch.zeros(4, 2), finished)
     for i in range(2):
         worst = minimize_scalar(
             lambda nu, i=i: nu + (finished[:, i] - nu).clamp_min(0).mean().item() / tail,
             bounds=(0.0, float(finished[:, i].max()) + 1), method="bounded",
             options={"xatol": 1e-6},
         )  # fmt: skip
-        measure = penalised.offset[i] + penalised.costs[..., i].sum() / len(finished)
+        measure = measured.offset[i] + measured.costs[..., i].sum() / len(finished)
         assert measure.item() == pytest.approx(worst.fun, rel=1e-4)
 
 
@@ -89,34 +83,27 @@ def test_batches_that_cut_episodes_charge_the_same(kind):
 def test_chance_charges_one_step_of_every_episode_over_the_limit():
     costs, ends = random_episodes()
     limits = torch.tensor([4.0, 0.0])
-    penalised = Chance(limits, most_over=0.2)(costs, ends, torch.zeros(4, 2), torch.empty(0, 2))
+    measured = Chance(limits, most_over=0.2)(costs, ends, torch.zeros(4, 2), torch.empty(0, 2))
     weight = limits.clamp_min(1)
     for row, first, last in episodes_of(costs, ends):
         spent = costs[row, first : last + 1].sum(0)
-        of_episode = penalised.costs[row, first : last + 1]
+        of_episode = measured.costs[row, first : last + 1]
         torch.testing.assert_close(of_episode.sum(0), torch.where(spent > limits, weight, 0.0))
         assert ((of_episode > 0).sum(0) <= 1).all()
-    torch.testing.assert_close(penalised.limit, 0.2 * weight)
+    torch.testing.assert_close(measured.limit, 0.2 * weight)
 
 
-def test_the_tail_is_ramped_in():
-    risk = cvar_of([5.0], tail=0.5, ramp_start=8, ramp_steps=8)
-    costs, ends = torch.ones(1, 4, 1), torch.tensor([[False, False, False, True]])
-    weights = []
-    for _ in range(6):
-        penalised = risk(costs, ends, torch.zeros(1, 1), torch.tensor([[4.0]]))
-        weights.append(risk.weight)
-        measure = penalised.costs.sum() + penalised.offset
-        assert measure.item() == pytest.approx(4.0)  # the worst of equal episodes is the mean one
-    assert weights == [0, 0, 0.5, 1, 1, 1]
-    assert risk.schedule.startswith("Until step 8 the mean is limited; from step 16 on the CVaR")
+def test_until_an_episode_has_finished_the_mean_is_measured():
+    risk, ends = cvar_of([5.0], tail=0.5), torch.zeros(1, 4, dtype=torch.bool)
+    measured = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.empty(0, 1))
+    assert measured.costs.sum() + measured.offset == 4.0
 
 
 def test_the_value_at_risk_is_that_of_the_last_episodes():
     risk, ends = cvar_of([5.0], tail=0.5, window=2), torch.zeros(1, 4, dtype=torch.bool)
     for finished in ([[9.0], [9.0]], [[1.0], [2.0]]):
-        penalised = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.tensor(finished))
-    assert penalised.offset == 1
+        measured = risk(torch.ones(1, 4, 1), ends, torch.zeros(1, 1), torch.tensor(finished))
+    assert measured.offset == 1
 
 
 def test_the_accounting_knows_what_open_episodes_have_cost():
@@ -137,98 +124,50 @@ def test_the_accounting_knows_what_open_episodes_have_cost():
         torch.testing.assert_close(known.float(), expected, atol=1e-4, rtol=1e-4)
 
 
-STEPS, EPISODES, TAIL = 5, 40_000, 0.25
+def normal_episodes(episodes=40_000, steps=5):
+    """Costs N(3, 0.3²) of steps [E, T, 1], so that C is normal; ends; mean and deviation of C."""
+    costs = 3 + 0.3 * torch.randn(episodes, steps, 1)
+    ends = torch.zeros(episodes, steps, dtype=torch.bool)
+    ends[:, -1] = True
+    return costs, ends, 3.0 * steps, 0.3 * steps**0.5
 
 
-def normal_actor():
-    """One state, actions N(3, 0.3²)."""
-    scale = AddStateIndependentNormalScale(1, init_value=-1.2)
-    net = nn.Sequential(nn.Linear(1, 1), scale)
-    nn.init.constant_(net[0].weight, 3.0)
-    nn.init.zeros_(net[0].bias)
-    return ProbabilisticActor(
-        TensorDictModule(net, in_keys=["observation"], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        distribution_class=IndependentNormal,
-        return_log_prob=True,
-    )
+def test_the_cvar_of_normal_costs():
+    """CVaR = μ + σ φ(z) / α with z the (1 − α)-quantile."""
+    costs, ends, mean, deviation = normal_episodes()
+    measured = cvar_of([1.0], 0.25)(costs, ends, torch.zeros(len(costs), 1), costs.sum(1))
+    measure = measured.offset + measured.costs.sum() / len(costs)
+    expected = mean + deviation * norm.pdf(norm.ppf(0.75)) / 0.25
+    assert measure.item() == pytest.approx(expected, rel=1e-3)
 
 
-def normal_costs(actor):
-    """Episodes of STEPS steps that cost their actions, so that C is normal."""
-    data = TensorDict(observation=torch.ones(EPISODES, STEPS, 1), batch_size=[EPISODES, STEPS])
-    with torch.no_grad():
-        actor(data.select("observation"))
-        dist = actor.get_dist(data)
-        data["action"] = dist.sample()
-        data["action_log_prob"] = dist.log_prob(data["action"])
-        data["loc"], data["scale"] = dist.base_dist.loc, dist.base_dist.scale
-    done = torch.zeros(EPISODES, STEPS, 1, dtype=torch.bool)
-    done[:, -1] = True
-    # a constant value is a baseline, which leaves the expected gradient as it is
-    zero = torch.zeros_like(data["action"])
-    data["next"] = TensorDict(cost=data["action"], cost_value=zero, done=done, terminated=done)
-    data["cost_value"] = zero
-    return data
+def test_the_chance_of_normal_costs():
+    costs, ends, mean, deviation = normal_episodes()
+    limit = mean + 0.5 * deviation
+    risk = Chance(torch.tensor([limit]), most_over=0.1)
+    measured = risk(costs, ends, torch.zeros(len(costs), 1), costs.sum(1))
+    share = measured.costs.sum().item() / len(costs) / limit
+    assert share == pytest.approx(1 - norm.cdf(0.5), abs=0.01)
 
 
-def slopes_of(risk, actor, data):
-    """Gradient of the measure by the parameters, as an update sees it."""
-    costs, ends = data["next", "cost"], data["next", "done"].squeeze(-1)
-    finished = costs.sum(1)
-    penalised = risk(costs, ends, torch.zeros(EPISODES, 1), finished)
-    data["next", PENALISED_COSTS] = penalised.costs
-    estimator = CostGAE([PENALISED_COSTS], None, gamma=1.0, lmbda=1.0, value_target="lambda_return")
-    estimator(data)
-    # a baseline that depends on time
-    data["advantage"] = data["cost_advantage"] - data["cost_advantage"].mean(0)
-    loss = TRPOLoss(actor, entropy_coeff=0.0)
-    by_step = torch.autograd.grad(loss(data)["loss_objective"], list(actor.parameters()))
-    gradient = dict(zip(("weight", "bias", "log_std"), by_step, strict=True))
-    measure = penalised.offset + penalised.costs.sum() / EPISODES
-    return measure.item(), {name: -STEPS * value.item() for name, value in gradient.items()}
+LIMITS = "cost_limits={cost_hazards: 2, cost_north: 1}"
 
 
-def test_the_gradient_of_cvar_in_closed_form():
-    """C is N(Tμ, Tσ²): CVaR = Tμ + √T σ φ(z) / α with z its (1 − α)-quantile."""
-    actor = normal_actor()
-    data = normal_costs(actor)
-    sigma, z = data["scale"][0, 0].item(), norm.ppf(1 - TAIL)
-    measure, slopes = slopes_of(cvar_of([1.0], TAIL, window=EPISODES), actor, data)
-    spread = STEPS**0.5 * sigma
-    assert measure == pytest.approx(3.0 * STEPS + spread * norm.pdf(z) / TAIL, rel=1e-3)
-    assert slopes["bias"] == pytest.approx(STEPS, rel=0.05)
-    assert slopes["log_std"] == pytest.approx(spread * norm.pdf(z) / TAIL, rel=0.05)
-
-
-def test_the_gradient_of_a_chance_in_closed_form():
-    """P(C > d) = 1 − Φ((d − Tμ) / √T σ); its derivatives are φ's."""
-    actor = normal_actor()
-    data = normal_costs(actor)
-    spread = STEPS**0.5 * data["scale"][0, 0].item()
-    limit = 3.0 * STEPS + 0.5 * spread
-    measure, slopes = slopes_of(Chance(torch.tensor([limit]), most_over=0.1), actor, data)
-    assert measure / limit == pytest.approx(1 - norm.cdf(0.5), abs=0.01)
-    # steps before the last one can pass the limit only in sum: T dμ, and T σ² d(log σ)
-    assert slopes["bias"] / limit == pytest.approx(norm.pdf(0.5) * STEPS / spread, rel=0.08)
-    assert slopes["log_std"] / limit == pytest.approx(0.5 * norm.pdf(0.5), rel=0.15)
-
-
-def train(directory, *overrides, **settings):
-    """A run of a second on the point mass."""
-    limits = "cost_limits={cost_hazards: 2, cost_north: 1}"
-    trainer = point_mass_trainer(directory, limits, "frames=320", *overrides, **settings)
-    trainer.run()
-    return trainer, read_table(directory / "progress.csv")
-
-
-@pytest.mark.parametrize(("algo", "risk"), [("ppo_lagrangian", "cvar"), ("cpo", "chance")])
+@pytest.mark.parametrize(
+    ("algo", "risk"),
+    [("ppo_lagrangian", "cvar"), ("cpo", "chance"), ("sac_lagrangian", "cvar")],
+)
 def test_every_algorithm_takes_it(tmp_path, algo, risk):
-    size = 40 if algo == "ppo_lagrangian" else None
-    extra = ["risk.ramp_start=0", "risk.ramp_steps=0", "risk.tail=0.25", "limits.drift=null"]
-    extra = extra if risk == "cvar" else []
-    trainer, table = train(tmp_path, f"algo={algo}", f"risk={risk}", *extra, minibatch_size=size)
-    assert trainer.algorithm.cost_advantage.reward_keys == [PENALISED_COSTS]
+    """What is compared with the limit is the measure."""
+    words = [f"algo={algo}", f"risk={risk}", LIMITS, "frames=320"]
+    words += ["risk.tail=0.25", "limits.drift=null"] if risk == "cvar" else []
+    if algo == "sac_lagrangian":
+        trainer = trainer_of(off_policy_config(*words), tmp_path)
+    else:
+        size = 40 if algo == "ppo_lagrangian" else None
+        trainer = point_mass_trainer(tmp_path, *words, minibatch_size=size)
+    trainer.run()
+    table = read_table(tmp_path / "progress.csv")
     for key, limit in (("cost_hazards", 2), ("cost_north", 1)):
         held = limit if risk == "cvar" else 0.1 * limit
         expected = [estimate - held for estimate in table[f"estimate_{key}"]]
@@ -245,11 +184,11 @@ def test_errors_of_a_controller_are_in_units_of_the_measures_limit(tmp_path):
 
 def test_limits_of_whole_batches_take_no_tails(tmp_path):
     with pytest.raises(ValueError, match=r"^risk: .*limits=null"):
-        train(tmp_path, "algo=ppo_lagrangian", "risk=cvar", "limits=null")
+        point_mass_trainer(tmp_path, "algo=ppo_lagrangian", "risk=cvar", LIMITS, "limits=null")
 
 
 def test_a_resumed_run_charges_as_if_it_had_never_stopped():
-    whole, second = (cvar_of([5.0], ramp_start=4, ramp_steps=100) for _ in range(2))
+    whole, second = (cvar_of([5.0]) for _ in range(2))
     batch = torch.rand(1, 8, 1), torch.zeros(1, 8, dtype=torch.bool), torch.rand(1, 1)
     whole(*batch, torch.rand(30, 1))
     second.load_state_dict(whole.state_dict())
