@@ -27,7 +27,7 @@ HEADS = {
     "seeds": "seeds", "cost": "episode cost", "return": "return", "since": "cost from 1M",
     "above": "above 25", "rate": "$\\rho_c$", "certified": "certified, at returns of",
     "new": "new episodes", "bound": "certified", "omnisafe": "OmniSafe, 10M steps",
-    "paper": "Ray et al. (2019), 10M steps",
+    "paper": "Ray et al. (2019), 10M steps", "tail": "CVaR",
 }  # fmt: skip
 # "PPOLag" in Table 2 of OmniSafe's benchmarks/on-policy/README.md, commit 15603dd: cost / return
 OMNISAFE = {
@@ -38,8 +38,7 @@ OMNISAFE = {
     "SafeSwimmerVelocity": "28.0 ± 4.1 / 65 ± 18",
     "SafeWalker2dVelocity": "13.5 ± 14.6 / 2982 ± 682",
 }
-# campaigns with the default settings and three million steps
-_THREE_MILLION = ("reference", "held_out", "eighteen")
+_THREE_MILLION = ("reference", "held_out", "eighteen")  # steps, and the default settings
 _CELL = ("environment", "algorithm")  # of a table: the runs that differ in seeds only
 Rows = list[dict[str, Any]]
 
@@ -74,6 +73,7 @@ def figures(run: Any, last: float, start: float = 0) -> dict[str, float]:
         "since": since.episode_cost.mean(),
         "above": (spans > LIMIT).mean(),
         "rate": epochs.cost_rate.iloc[-1],
+        "tail": late.get("violation_cost", late.cost_rate).mean() + run.cost_limits.get("cost", 0),
     }
 
 
@@ -98,6 +98,7 @@ def summary(
         "since": f"{mean.since:.1f}",
         "above": f"{100 * mean.above:.0f} %",
         "rate": f"{mean['rate']:.3f}",
+        "tail": f"{mean['tail']:.0f}",  # if a CVaR is limited
         "certified": certified(group),
         "new": new_episodes(group),
     }
@@ -169,25 +170,24 @@ def single(campaign: str) -> str:
     rows, times = [], [0, 250_000, 500_000, MILLION, 2 * MILLION]
     names = [f"to {end / MILLION:g}M" for end in times[1:]]
     for _, found in runs(campaign).iterrows():
-        epochs = pandas.DataFrame(found.run.table)
+        run, epochs = found.run, pandas.DataFrame(found.run.table)
         parts = epochs.groupby(pandas.cut(epochs.steps, times, labels=names), observed=False)
         means = parts[["episode_cost", "episode_return"]].mean()
         row = summary(found.to_frame().T, MILLION / 2) | {"seed": found.seed}
         row |= {n: "" if np.isnan(c) else f"{c:.0f} / {r:.1f}" for n, c, r in means.itertuples()}
-        told = found.run.notes.get("certificate") or {}
-        missed = told.get("shortfalls")
-        row["bound"] = f"no, by {missed['mean_cost']:.1f}" if missed else "—"
+        told = run.notes.get("certificate") or {}
+        missed = (told.get("shortfalls") or {}).get("mean_cost")
+        row["bound"] = f"no, by {missed:.1f}" if missed else "—"
         if told.get("certified"):
-            bound = told["bounds"]["mean_cost"]["bound"]
-            claim = f"≤ {rounded_up(bound):.1f}"
-            if stops_within_limit(found.run.settings.get("transforms") or {}):
+            claim = f"≤ {rounded_up(told['bounds']['mean_cost']['bound']):.1f}"
+            if stops_within_limit(run.settings.get("transforms") or {}):
                 claim = "by construction,"
             row["bound"] = f"{claim} at {told['episode_return']:.1f}"
         rows.append(row)
-    settings = ["name"] if len({row["name"] for row in rows}) > 1 else []
+    differ = [key for key in ("name", "algorithm") if len({row[key] for row in rows}) > 1]
     names = [name for name in names if any(row[name] for row in rows)]
-    ends = ("cost", "return", "rate", "bound")
-    return table(rows, "environment", *settings, "seed", *ends, "steps", *names)
+    ends = ("cost", *(["tail"] if campaign == "cvar" else []), "return", "rate", "bound")
+    return table(rows, "environment", *differ, "seed", *ends, "steps", *names)
 
 
 def stops_within_limit(transforms: Mapping[str, Any]) -> bool:

@@ -6,7 +6,7 @@ up to an offset. So the estimates of J_c, the target and the multiplier are thos
 
 The policy learns from the costs themselves: λ rises until the measure is within its limit. The
 gradient of the measure comes from the few steps of its tail. In batches of twenty episodes it is
-noise, by which no run has kept a limit (`docs/transforms.md`, results).
+noise, by which no run has kept a limit (`docs/guides/limits.md`).
 
 A step has a measured cost if the cost of its episode up to this step passes a threshold. So the
 measure needs the cost of unfinished episodes at the start of a batch, but no batches of whole
