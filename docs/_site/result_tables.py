@@ -38,7 +38,7 @@ OMNISAFE = {
     "SafeSwimmerVelocity": "28.0 ± 4.1 / 65 ± 18",
     "SafeWalker2dVelocity": "13.5 ± 14.6 / 2982 ± 682",
 }
-_THREE_MILLION = ("reference", "held_out", "eighteen")  # steps, and the default settings
+_THREE_MILLION = ("reference", "held_out", "eighteen")  # campaigns with the defaults
 _CELL = ("environment", "algorithm")  # of a table: the runs that differ in seeds only
 Rows = list[dict[str, Any]]
 

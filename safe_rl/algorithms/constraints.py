@@ -106,7 +106,7 @@ class Constraints(Resumable):
             return cls({}, max_length=max_length, device=config.device)
         values = torch.tensor(list(limits.values()))
         known = {"steps_per_decision": env.steps_per_decision, "max_length": max_length}
-        risk = instantiate(config.get("risk"), cost_limits=values)
+        risk = instantiate(config.get("risk"), known, cost_limits=values)
         tracker = instantiate(config.get("limits"), known, cost_limits=values)
         return cls(limits, max_length=max_length, tracker=tracker, risk=risk, device=config.device)
 
@@ -136,10 +136,10 @@ class Constraints(Resumable):
             return self._compare_episodes(batch, episodes)
         costs = torch.cat([batch["next", key] for key in self.keys], -1)
         if self.risk is not None:
-            ends = batch["next", "done"].squeeze(-1).cpu()
+            steps, ends = costs.cpu(), batch["next", "done"].squeeze(-1).cpu()
             before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
             finished = episodes.episode_costs(self.keys).cpu()
-            self._measured = self.risk(costs.cpu(), ends, before.cpu().to(costs.dtype), finished)
+            self._measured = self.risk(steps, ends, before.to(steps), finished)
         state = self.tracker.update(costs, episodes.decisions, self._measured)
         return state.to(self.limits)
 

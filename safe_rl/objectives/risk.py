@@ -4,9 +4,9 @@ With a limit d on the mean cost, a third to a half of the episodes cost more tha
 replaces the costs of steps by *measured costs*. The mean over episodes of their sum is the measure,
 up to an offset. So the estimates of J_c, the target and the multiplier are those of the measure.
 
-The policy learns from the costs themselves: λ rises until the measure is within its limit. The
-gradient of the measure comes from the few steps of its tail. In batches of twenty episodes it is
-noise, by which no run has kept a limit (`docs/guides/limits.md`).
+The policy learns from the costs themselves, and the measure only says how strongly. The CVaR's own
+gradient comes from the few steps of its tail, two episodes of a batch of twenty: with it none of
+four runs kept a limit (`docs/guides/limits.md`).
 
 A step has a measured cost if the cost of its episode up to this step passes a threshold. So the
 measure needs the cost of unfinished episodes at the start of a batch, but no batches of whole
