@@ -165,8 +165,11 @@ class Constraints(Resumable):
         return LimitState.of(cost=costs, limit=self.limits, length=length, is_new=is_new)
 
     def record_prediction(self, state: LimitState, metrics: Mapping[str, Tensor]) -> None:
-        """Store the change of J_c that an update's surrogates predict, if it reports them."""
-        if self.tracker is not None and "cost_surrogate" in metrics:
+        """Store the change of J_c that an update's surrogates predict, if it reports them.
+
+        They are of the mean cost, so a change of a risk measure is not compared with them.
+        """
+        if self.tracker is not None and self.risk is None and "cost_surrogate" in metrics:
             change = metrics["cost_surrogate"] * state.length_for(state.cost)
             self.tracker.predictions.record_prediction(change)
 

@@ -1,17 +1,21 @@
 """Limits on tails: against their definitions, in closed form, and in runs of any algorithm."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from point_mass_runs import point_mass_trainer, trainer_of
-from run_configs import off_policy_config
+from run_configs import off_policy_config, point_mass_config
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 from tensordict import TensorDict
 
+from safe_rl.algorithms.constraints import Constraints
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CVaR
-from safe_rl.objectives.risk import cost_so_far
+from safe_rl.objectives.risk import MeasuredCosts, RiskMeasure, cost_so_far
 from safe_rl.runs.table import read_table
+from safe_rl.trust import allow
 
 
 def cvar_of(limits, tail=0.25, window=10_000):
@@ -172,8 +176,30 @@ def test_every_algorithm_takes_it(tmp_path, algo, risk):
         held = limit if risk == "cvar" else 0.1 * limit
         expected = [estimate - held for estimate in table[f"estimate_{key}"]]
         assert table[f"violation_{key}"] == pytest.approx(expected, abs=1e-5)
+        # surrogates predict the mean cost: the change of another measure says nothing about them
+        assert algo != "cpo" or table[f"trust_{key}"] == [1.0] * len(expected)
     pairs = zip(table["estimate_cost_hazards"], table["episode_cost_hazards"], strict=True)
     assert risk == "chance" or all(tail > mean for tail, mean in pairs if mean > 0)
+
+
+class OfYourOwn(RiskMeasure):
+    """The mean cost, that asks for all that a measure can be given."""
+
+    def __init__(self, cost_limits, *, max_length, steps_per_decision, share):
+        self.limits, self.given = share * cost_limits, (max_length, steps_per_decision)
+
+    def __call__(self, costs, ends, before, finished):
+        return MeasuredCosts(costs, torch.zeros_like(self.limits), self.limits)
+
+
+def test_a_measure_of_your_own_knows_the_length_of_episodes_in_decisions():
+    config = point_mass_config("algo=ppo_lagrangian", LIMITS)
+    config.risk = {"_target_": f"{__name__}.OfYourOwn", "share": 0.5}
+    env = SimpleNamespace(max_episode_steps=22, steps_per_decision=4)
+    allow(__name__)
+    constraints = Constraints.from_config(config, env)
+    assert constraints.risk.given == (6, 4)
+    assert constraints.measured_limits == {"cost_hazards": 1.0, "cost_north": 0.5}
 
 
 def test_errors_of_a_controller_are_in_units_of_the_measures_limit(tmp_path):
