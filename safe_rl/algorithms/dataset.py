@@ -9,7 +9,7 @@ from re import search
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
@@ -68,17 +68,48 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
         learns_from = _fill(buffer, steps, interface, node, config.cost_limits, env)
     except (ValueError, FloatingPointError) as error:
         raise ValueError(f"dataset.path={node.path}: {error}") from error
-    return learns_from + _other_environment(config), not node.alone
+    is_raw = not Path(node.path).is_dir()
+    warnings = _other_environment(config) + _ignored_transforms(
+        config, is_raw=is_raw, evaluating=bool(interface.get("evaluating"))
+    )
+    return learns_from + warnings, not node.alone
 
 
 def _other_environment(config: DictConfig) -> str:
     """A warning if the recording is of a run in another environment; else an empty text."""
+    here: Any = OmegaConf.to_container(config, resolve=True)
     try:
-        name = read_config(Path(config.dataset.path).parent / "config.yaml")["env"]["name"]
+        there = read_config(Path(config.dataset.path).parent / "config.yaml")
+        name = there["env"]["name"]
     except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
         return ""
-    here = config.env.name
-    return "" if name == here else f" Warning: they are of {name}, and this environment is {here}."
+    if name != config.env.name:
+        return f" Warning: they are of {name}, and this environment is {config.env.name}."
+    changed = [
+        f"env.{key}"
+        for key, value in there["env"].items()
+        if value is not None and here["env"].get(key, value) not in (value, None)
+    ]
+    before, now = there.get("transforms") or {}, here.get("transforms") or {}
+    changed += [f"transforms.{key}" for key in {**before, **now} if before.get(key) != now.get(key)]
+    return f" Warning: they are of a run with other {', '.join(changed)}." if changed else ""
+
+
+def _ignored_transforms(config: DictConfig, *, is_raw: bool, evaluating: bool) -> str:
+    """A warning on transforms without effect on what was read; else an empty text.
+
+    On a file none has, and on an evaluation none of those that change rewards or ends to learn.
+    """
+    chosen = config.get("transforms") or {}
+    ignored = [
+        name for name, node in chosen.items() if is_raw or (evaluating and "budgets" in node)
+    ]
+    if not ignored:
+        return ""
+    return (
+        f" Warning: transforms=[{','.join(ignored)}] act on what is collected, not on it: its "
+        "observations, rewards and ends are used as they are."
+    )
 
 
 def _fill(
@@ -134,13 +165,20 @@ def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> None:
                 "Costs are those of single steps, not sums over an episode or over kinds: rescale "
                 "or clip them."
             )
-    ends = steps["next", "done"].flatten().nonzero().flatten()
+    longest, ends = env.max_episode_steps, steps["next", "done"].flatten().clone()
+    ends[-1] = True
+    ends = ends.nonzero().flatten()
     lengths = ends.diff(prepend=ends.new_tensor([-1]))
-    terminated = lengths[steps["next", "terminated"].flatten()[ends]]
-    if len(terminated) > 1 and (terminated == env.max_episode_steps).all():
+    if lengths.max() > longest:
         raise ValueError(
-            f"all episodes that terminate have {env.max_episode_steps} steps, so these are "
-            "time-outs, after which values are bootstrapped: mark them in timeouts only."
+            f"it has {lengths.max():,} steps without an end, and episodes of this environment have "
+            f"at most {longest:,}: mark every end in terminals or timeouts."
+        )
+    terminated = lengths[steps["next", "terminated"].flatten()[ends]] == longest
+    if terminated.sum() > 1 and (terminated.all() or not steps["next", "truncated"].any()):
+        raise ValueError(
+            f"its episodes of {longest} steps terminate, so these are time-outs, after which "
+            "values are bootstrapped: mark them in timeouts only."
         )
 
 
@@ -148,8 +186,9 @@ def _order_columns(
     steps: TensorDictBase, interface: Mapping[str, Any], node: DictConfig, env: EnvBase
 ) -> str:
     """Put the columns of observations into the environment's order; return a warning, or ""."""
-    columns, here = interface.get("columns"), env.column_names
-    if columns is None and node.get("columns") == "safety_gymnasium":
+    named, here = interface.get("columns"), env.column_names
+    columns = named
+    if named is None and node.get("columns") == "safety_gymnasium":
         columns = safety_gymnasium_columns(here)
     if columns is not None:
         sensors = interface.get("sensors"), env.sensor_keys
@@ -157,8 +196,10 @@ def _order_columns(
         if order != [*range(len(here))]:
             for key in ("observation", ("next", "observation")):
                 steps[key] = steps[key][..., order]
+    if named is not None:
         return ""
-    if match := search(r"(?:Safety|Offline)\w+Gymnasium-v\d", Path(node.path).name):
+    match = search(r"(?:Safety|Offline)\w+Gymnasium-v\d", Path(node.path).name)
+    if match and columns is None:
         raise ValueError(
             f"it is of {match[0]}, whose columns have another order: dataset.columns="
             "safety_gymnasium."
@@ -167,12 +208,15 @@ def _order_columns(
     if isinstance(spec, Bounded):
         beyond = (seen < spec.low[0].cpu() - 1e-3) | (seen > spec.high[0].cpu() + 1e-3)
         if number := int(beyond.any(0).sum()):
+            other = "need" if columns is None else "alone need"
             raise ValueError(
                 f"{number} of the {len(here)} columns of its observations leave the bounds of this "
                 "environment's: their order is another one. Files of Safety-Gymnasium and DSRL "
-                "need dataset.columns=safety_gymnasium; others can name their columns in the "
+                f"{other} dataset.columns=safety_gymnasium; others can name their columns in the "
                 f"attribute observation_columns: {here[0]}, …"
             )
+    if columns is not None:
+        return ""
     return " Warning: it does not name the columns of its observations, which are used as they are."
 
 

@@ -68,7 +68,10 @@ def read_columns(path: Path | str) -> dict[str, Any]:
         return read_interface(path)
     with open_hdf5(path) as file:
         names = file.attrs.get("observation_columns")
-        return {} if names is None else {"columns": [str(name) for name in np.ravel(names)]}
+        if names is None:
+            return {}
+        texts = (n.decode() if isinstance(n, bytes) else str(n) for n in np.ravel(names))
+        return {"columns": list(texts)}
 
 
 # The order of Safety-Gymnasium 1.0, also in files of DSRL: the robot's sensors, velocities of
@@ -143,6 +146,10 @@ def read_hdf5(path: Path | str) -> TensorDict:
         nodes = _nodes(path, file)
         episodes = (name for name in nodes if fullmatch(r"episode_\d{1,18}", name))
         names = sorted(episodes, key=lambda name: int(name[8:]))
+        if names and (total := file.attrs.get("total_episodes", len(names))) != len(names):
+            raise ValueError(
+                f"{path} says that it has {total} episodes, and {len(names)} are there."
+            )
         arrays = _read_episodes(path, nodes, names) if names else _read_flat(path, nodes)
     number = len(arrays["action"])
     if not number:

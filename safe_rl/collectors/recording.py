@@ -194,7 +194,7 @@ def read_recording(folder: Path | str) -> TensorDict:
 
     Raises:
         FileNotFoundError: If the folder has no transitions.
-        ValueError: If a batch cannot be read, or holds more than tensors.
+        ValueError: If a batch is missing, cannot be read, or holds more than tensors.
     """
     pieces = _pieces(Path(folder))
     if not pieces:
@@ -202,7 +202,14 @@ def read_recording(folder: Path | str) -> TensorDict:
         places = " or ".join(map(str, below))
         hint = f"give {places}." if below else "is it the folder of a recording?"
         raise FileNotFoundError(f"{folder} holds no transitions: {hint}")
-    return torch.cat([_read(path) for path in pieces], -1)
+    batches = [_read(path) for path in pieces]
+    for before, after, batch in zip(pieces, pieces[1:], batches, strict=False):
+        # a run that was not recorded for a while has ended the episodes there
+        if int(after.stem) != int(before.stem) + 1 and not batch["next", "done"][:, -1].all():
+            raise ValueError(
+                f"{folder}: batches between {before.name} and {after.name} are missing."
+            )
+    return torch.cat(batches, -1)
 
 
 def _read(path: Path) -> TensorDict:

@@ -114,7 +114,8 @@ class PolicyEvaluation:
             recorder = None
             if record is not None:
                 known = {"is_privileged": bool(env.privileged_layout)}
-                recorder = StepRecorder(Recording(record, env.cost_keys, env.interface, **known))
+                about = {**env.interface, "evaluating": True}
+                recorder = StepRecorder(Recording(record, env.cost_keys, about, **known))
             torch.manual_seed(self.seed)
             episodes = collect_episodes(
                 env, policy, options.episodes, env.cost_keys, deterministic=options.deterministic,

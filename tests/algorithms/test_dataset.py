@@ -122,7 +122,20 @@ def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
     with h5py.File(path, "a") as file:
         file["terminals"][...] = file["timeouts"][:]
     env = make_tank()
-    with pytest.raises(ValueError, match="all episodes that terminate have 20 steps, so these are"):
+    time_outs = "its episodes of 20 steps terminate, so these are time-outs"
+    with pytest.raises(ValueError, match=time_outs):
+        learned_actions(path, env)
+    write_episodes(path, "Tank-v0", 1.0, episodes=3)
+    with h5py.File(path, "a") as file:
+        ends = file["timeouts"][:]
+        ends[9] = True  # one ends early
+        file["terminals"][...], file["timeouts"][...] = ends, False
+    with pytest.raises(ValueError, match=time_outs):
+        learned_actions(path, env)
+    with h5py.File(path, "a") as file:
+        file["terminals"][...] = np.arange(60) == 9
+        del file["next_observations"]
+    with pytest.raises(ValueError, match=r"50 steps without an end, and episodes .* at most 20"):
         learned_actions(path, env)
     write_episodes(path, "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
     env = make_env("PointGoal1", num_envs=1, seed=0)
@@ -171,13 +184,17 @@ def test_columns_are_taken_by_their_names(tmp_path):
         assert {tuple(row) for row in found.tolist()} <= {tuple(row) for row in expected.tolist()}
 
     check(tmp_path / "own.hdf5", "dataset.columns=safety_gymnasium")
+    write_episodes(tmp_path / "ours.hdf5", "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
+    with pytest.raises(ValueError, match="and DSRL alone need dataset"):
+        learned(tmp_path / "ours.hdf5", env, "dataset.columns=safety_gymnasium")
     (tmp_path / "own.hdf5").rename(tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5")
     with pytest.raises(ValueError, match=r"is of SafetyPointGoal1Gymnasium-v0, whose columns"):
         learned(tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5", env)
     path = (tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5").rename(tmp_path / "a.hdf5")
-    with h5py.File(path, "a") as file:
-        file.attrs["observation_columns"] = theirs
-    check(path)
+    for names in (theirs, np.array(theirs, dtype="S")):
+        with h5py.File(path, "a") as file:
+            file.attrs["observation_columns"] = names
+        check(path)
     with h5py.File(path, "a") as file:
         renamed = [name.replace("vases", "gremlins") for name in theirs]
         file.attrs["observation_columns"] = renamed
@@ -234,7 +251,12 @@ def test_a_file_without_names_is_used_with_a_warning(tmp_path):
     write_episodes(tmp_path / "data.hdf5", "Tank-v0", 0.5)
     env = make_tank()
     path, words = tmp_path / "data.hdf5", ("env.id=Tank-v0",)
-    assert "not name the columns" in learner(path, env, *words, name="gymnasium").learns_from
+    told = learner(path, env, *words, name="gymnasium").learns_from
+    assert "not name the columns" in told
+    assert "transforms" not in told
+    scale = "+transforms.scale={_target_: torchrl.envs.RewardScaling, loc: 0, scale: 0.01}"
+    told = learner(path, env, *words, scale, name="gymnasium").learns_from
+    assert "Warning: transforms=[scale] act on what is collected, not on it" in told
 
 
 @pytest.mark.long

@@ -87,6 +87,11 @@ def test_episodes_end_where_batches_are_missing(tmp_path):
     recording.cut_after(3)  # by a resumed run, of which two rows begin within an episode
     recording.write(4, batches[0], begun=torch.tensor([True, True, False, False]))
     assert read_recording(tmp_path)["partial"][:, 50, 0].tolist() == [True, True, False, False]
+    (tmp_path / "00000000.pt").rename(tmp_path / "00000002.pt")
+    (tmp_path / "00000003.pt").unlink()
+    recording.write(2, batches[2])
+    with pytest.raises(ValueError, match=r"between 00000002.pt and 00000004.pt are missing"):
+        read_recording(tmp_path)
 
 
 @pytest.mark.parametrize("limits", [{"cost": 2.0}, {"cost_hazards": 1.0, "cost_north": 0.0}, {}])
@@ -192,6 +197,10 @@ def test_episodes_of_minari_are_read_in_their_order(reset_infos, tmp_path, h5py)
     # the first one terminates, the others were cut off
     assert steps["next", "terminated"].flatten().nonzero().flatten().tolist() == [2]
     assert "is_good" not in steps["next"].keys()  # noqa: SIM118
+    with h5py.File(tmp_path / "main_data.hdf5", "a") as file:
+        file.attrs["total_episodes"] = 13
+    with pytest.raises(ValueError, match="says that it has 13 episodes, and 12 are there"):
+        read_dataset(tmp_path / "main_data.hdf5")
 
 
 def test_what_is_no_dataset_is_refused(tmp_path, h5py):

@@ -1,10 +1,12 @@
 """Learning from a dataset: what is taken of it, what is cloned, and what does not fit."""
 
+import json
 from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf, open_dict
 from point_mass import Forgetful, PointMass
 from point_mass_runs import trainer_of
 from run_configs import assert_resumes_exactly, compose_config
@@ -82,6 +84,32 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     assert table["policy_loss_actor"][-1] < 0.01 < table["policy_loss_actor"][0]
     assert table["policy_num_updates"] == [160] * 8
     assert len(trainer.algorithm.replay_buffer) == 160  # nothing of what it did itself
+
+
+def test_keys_and_transforms_that_differ_are_named(tmp_path):
+    data = record(tmp_path / "data", head_south)
+    config = offline_config(data)
+    there = OmegaConf.to_container(OmegaConf.masked_copy(config, ["env"]), resolve=True)
+    there |= {"transforms": {"scale": {"factor": 0.1}}}
+    there["env"]["hazard"] = 0.5
+
+    def told(**keys):
+        (tmp_path / "config.yaml").write_text(json.dumps(there))
+        with open_dict(config):
+            config.update(keys)
+        return trainer_of(config, tmp_path / "run").algorithm.learns_from.partition("limits.")[2]
+
+    assert told() == " Warning: they are of a run with other transforms.scale."
+    assert told(transforms=there["transforms"]) == ""
+    changed = " Warning: they are of a run with other env.hazard."
+    assert told(env={**there["env"], "hazard": 0.4}) == changed
+    there["transforms"] |= {"stop": {"budgets": {"cost": 1}}}
+    about = {**PointMass().interface, "evaluating": True}  # of an evaluation: no episode stopped
+    (data / "recording.json").write_text(json.dumps(about))
+    assert told(transforms=there["transforms"]) == (
+        f"{changed} Warning: transforms=[stop] act on what is collected, not on it: its "
+        "observations, rewards and ends are used as they are."
+    )
 
 
 def test_it_resumes_as_if_it_had_never_stopped(tmp_path):
