@@ -109,3 +109,12 @@ COST = "cost"
 def is_cost(name: Any) -> bool:
     """Whether a name is that of a cost: `cost` or `cost_<kind>`."""
     return name == COST or str(name).startswith(f"{COST}_")
+
+
+#: What such names usually mean is no cost of a step: users who mean one write it in `cost_keys`.
+_NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", "total", "return")}
+
+
+def found_costs(names: Iterable[Any]) -> list[str]:
+    """Names of the costs of a step among those that an environment writes."""
+    return [str(name) for name in names if is_cost(name) and name not in _NOT_OF_STEPS]

@@ -118,9 +118,18 @@ def test_a_cost_that_comes_late_and_is_not_counted_is_told():
             *values, info = super().step(action)
             return *values, info | ({"cost_b": 1.0} if self.count == 3 else {})
 
+    class WithItsLimit(Counter):
+        def step(self, action):
+            *values, info = super().step(action)
+            return *values, info | {"cost_limit": 25.0, "cost_total": 3.0}
+
     env = from_gymnasium(Late, num_envs=1, num_steps=6, seed=5)
     with pytest.warns(UserWarning, match=r"info\['cost_b'\] is not counted.*cost,cost_l"):
         env.rollout(4)
+    env = from_gymnasium(WithItsLimit, num_envs=1, num_steps=6, seed=5)
+    assert env.cost_keys == ["cost", "cost_late"]
+    with pytest.warns(UserWarning, match=r"info\['cost_limit'\] is not counted"):
+        env.rollout(2)
 
 
 @pytest.mark.parametrize("name", ["reward", "a.b"])  # a step writes it; it would be nested

@@ -4,6 +4,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import gymnasium
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
@@ -81,12 +82,28 @@ def test_a_step_whose_physics_failed_costs_what_it_returns():
     assert not step["cost_fast"][:, 2].any()
 
 
+class OfAnotherOrder(gymnasium.Wrapper):
+    """The cost, a whole number, comes after the ends."""
+
+    def __init__(self, make):
+        super().__init__(make())
+
+    def step(self, action):
+        observation, reward, cost, terminated, truncated, info = self.env.step(action)
+        return observation, reward, bool(terminated), bool(truncated), int(cost), info
+
+
 def test_a_function_may_return_six_values_and_a_missing_package_is_said(monkeypatch, package):
     ice = partial(package.make, "SafetyIce1-v0")
     env = from_gymnasium(ice, num_envs=5, num_steps=12, seed=0)
     assert env.cost_keys == ["cost", "cost_right", "cost_fast"]
     step = rollout(env)["next"]
     torch.testing.assert_close(step["cost"], step["cost_right"] + step["cost_fast"])
+    swapped = partial(OfAnotherOrder, ice)
+    with pytest.raises(
+        ConfigError, match=r"fifth value of a step \(observation, reward, cost, ter"
+    ):
+        rollout(from_gymnasium(swapped, cost_keys=["cost"], num_steps=12, seed=0))
     with pytest.raises(ConfigError, match="third of six values: name 'cost' in cost_keys"):
         rollout(from_gymnasium(ice, cost_keys=["cost_fast"], num_steps=12, seed=0))
     monkeypatch.setitem(sys.modules, "safety_gymnasium", None)

@@ -19,7 +19,7 @@ from safe_rl.envs.gymnasium.gymnasium_env import (
     GymnasiumEnv,
     make_adapted,
 )
-from safe_rl.envs.keys import ConfigError, Count, checked, is_cost
+from safe_rl.envs.keys import ConfigError, Count, checked, found_costs
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
@@ -204,7 +204,7 @@ def _find_costs(probe: gymnasium.Env) -> list[str]:
     probe.action_space.seed(0)
     probe.reset(seed=0)
     *_, info = CheckedSteps(probe, [], watch=False).step(probe.action_space.sample())
-    return [key for key in info if is_cost(key)]
+    return found_costs(info)
 
 
 def _arguments(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
 _WRITTEN = ("action", "reward", "done", "terminated", "truncated")
+_Bool = bool | np.bool_
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
 
@@ -97,6 +98,9 @@ class CheckedSteps(gymnasium.Wrapper):
         if not isinstance(info, dict):
             raise self._wrong("info", "a dictionary", info)
         self._check("observation", self.observation_space, observation)
+        if cost and isinstance(cost[0], _Bool) and not isinstance(truncated, _Bool):
+            order = "observation, reward, cost, terminated, truncated, info"
+            raise self._wrong(f"the fifth value of a step ({order})", "True or False", truncated)
         if cost and self._cost_keys and COST not in self._cost_keys:
             raise ConfigError(
                 f"{self.unwrapped}: a step returns its cost as the third of six values: name "
@@ -109,7 +113,7 @@ class CheckedSteps(gymnasium.Wrapper):
             self._tell_uncounted(info)
         info |= {k: self._number(f"info['{k}']", info[k]) for k in self._cost_keys if k in info}
         for name, end in (("terminated", terminated), ("truncated", truncated)):
-            if not isinstance(end, bool | np.bool_ | int | np.integer):
+            if not isinstance(end, _Bool | int | np.integer):
                 raise self._wrong(name, "True or False", end)
         return observation, self._number("the reward", reward), terminated, truncated, info
 

@@ -32,7 +32,7 @@ from torchrl.envs.transforms import Transform
 
 from safe_rl.envs.contract import ConstrainedEnv, bounds_of
 from safe_rl.envs.foreign import FOREIGN, complete_foreign
-from safe_rl.envs.keys import ConfigError, is_cost
+from safe_rl.envs.keys import ConfigError, found_costs
 from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
@@ -123,7 +123,7 @@ def describe_node(config: Mapping[str, Any]) -> tuple[list[str], int]:
                 f"env.id={config['id']} does not say how long episodes are: give env.num_steps=…"
             )
         entries = (*env.observation_spec.keys(), *env.full_reward_spec.keys())
-        cost_keys = [str(key) for key in entries if is_cost(key)]
+        cost_keys = found_costs(entries)
         return cost_keys if config["cost_keys"] is None else list(config["cost_keys"]), steps
     finally:
         env.close(raise_if_closed=False)
