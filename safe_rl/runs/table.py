@@ -89,7 +89,7 @@ def _first_rows(path: Path, number: int) -> list[str]:
 def _complete_lines(path: Path) -> list[str]:
     """Lines of a table without the last one if its end is still missing."""
     try:
-        lines = read_bounded(path, MOST_BYTES).decode().splitlines(keepends=True)
+        lines = read_bounded(path, MOST_BYTES).decode("utf-8-sig").splitlines(keepends=True)
     except UnicodeDecodeError:
         raise TableError(f"{path} is no table: it is not text.") from None
     return [line for line in lines if line.endswith("\n")]
@@ -106,6 +106,8 @@ def _columns_of(path: Path, lines: Sequence[str]) -> dict[str, list[float]]:
     names, *rows = csv.reader(lines)
     if len(names) > _MOST_COLUMNS:
         raise TableError(f"{path} has {len(names):,} columns, more than any run writes.")
+    if len({*names}) < len(names):
+        raise TableError(f"{path} has two columns of one name: {','.join(names)}.")
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
             raise TableError(

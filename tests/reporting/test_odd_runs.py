@@ -72,6 +72,7 @@ UNREADABLE_FILES = {
     "evaluation is a list": lambda run: evaluate(run, '["estimates"]'),
     "deep": lambda run: evaluate(run, "[" * 100_000),
     "certificate is a list": lambda run: (run / "certificate.json").write_text("[3]"),
+    "unfinished row": lambda run: (run / "progress.csv").open("a").write("9,9000,"),
     "overrides": lambda run: (run / ".hydra/overrides.yaml").write_text("{"),
     "hydra": lambda run: (run / ".hydra/hydra.yaml").write_text("hydra: [[["),
 }  # fmt: skip

@@ -59,6 +59,8 @@ def test_a_row_that_is_cut_off_is_no_row(tmp_path):
     for cut_off in ("2", "2,4", "2,40"):
         path.write_text(f"epoch,steps\n1,20\n{cut_off}")
         assert read_table(path) == {"epoch": [1.0], "steps": [20.0]}
+    path.write_text("\ufeffepoch,steps\n1,20\n")  # as spreadsheets save it
+    assert read_table(path) == {"epoch": [1.0], "steps": [20.0]}
     path.write_text("epoch,st")
     with pytest.raises(ValueError, match="has not finished an epoch"):
         read_table(path)
@@ -67,7 +69,7 @@ def test_a_row_that_is_cut_off_is_no_row(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda b: b"\xef\xbb\xbf" + b, "have the columns of the first"),
+        (lambda b: b.replace(b"steps", b"epoch", 1), "two columns of one name: epoch,epoch"),
         (lambda b: b.replace(b"steps", b"stepz", 1), "have the columns of the first"),
         (lambda b: b.replace(b"\n", b"\n\n", 1), "line 2 has 0 fields and the header"),
         (lambda b: b"\x80\x81" + b, "is no table: it is not text"),
