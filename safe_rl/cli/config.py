@@ -265,7 +265,8 @@ def _check_parts(config: DictConfig) -> None:
         part = config.get(name)
         if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):
             words = "" if config.preset in ("default", "paper") else f"preset={config.preset}: "
-            raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.")
+            hint = " For a replay buffer use algo=sac_lagrangian." if name == "memory" else ""
+            raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.{hint}")
 
 
 def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> None:
@@ -314,6 +315,6 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
     same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
     meant = same or filter(None, [nearest(key, known, 0.7)])
     names = " or ".join(f"'{path}'" for path in meant)
-    return f"there is no key '{key}'. " + (
-        f"Did you mean {names}?" if names else "'--cfg job' prints all keys."
-    )
+    if names:
+        return f"there is no key '{key}'. Did you mean {names}?"
+    return f"with this algorithm and environment there is no key '{key}'. '--cfg job' prints all."

@@ -24,8 +24,8 @@ class ExportOptions(CheckedOptions):
     checkpoint: str = option(
         "", "last, best, certified, or a path; certified if there is one, else last"
     )
-    actions: Literal["", "mean", "sampled"] = option(
-        "", "of FILE.onnx: mean or sampled; as they are certified, else mean"
+    actions: Literal["mean", "sampled"] | None = option(
+        None, "of FILE.onnx: mean or sampled; as they are certified, else mean"
     )
 
 
@@ -65,7 +65,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     return 0
 
 
-def _choose_actions(run: Run, checkpoint: Path, asked: str) -> bool:
+def _choose_actions(run: Run, checkpoint: Path, asked: str | None) -> bool:
     """Whether the exported policy samples: as it was certified, unless the user asks otherwise."""
     from safe_rl.evaluation.policies import is_sampled
 
@@ -73,7 +73,7 @@ def _choose_actions(run: Run, checkpoint: Path, asked: str) -> bool:
     if certificate is None:
         return asked == "sampled"
     certified = "sampled" if is_sampled(certificate) else "mean"
-    if asked not in ("", certified):
+    if asked not in (None, certified):
         print(
             f"WARNING: this policy is certified with {certified} actions. The file has its {asked} "
             "actions, which the certificate does not cover, and so the file has no certificate. To "

@@ -95,8 +95,10 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     for former in (target.checkpoints_folder, target.robot_folder):
         shutil.rmtree(former, ignore_errors=True)
     kept.parent.mkdir(parents=True)
+    for former in target.evaluation_files:  # of a policy that was exported there before
+        former.unlink()
     for name in (Run.config_file, Run.code_file, Run.robot_file, Run.certificate_file):
-        (folder / name).unlink(missing_ok=True)  # of a policy that was exported there before
+        (folder / name).unlink(missing_ok=True)
         if (run / name).is_file() and (is_certified or name != Run.certificate_file):
             shutil.copyfile(run / name, folder / name)
     if source.robot_folder.is_dir() and not source.robot_folder.is_symlink():

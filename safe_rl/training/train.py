@@ -189,6 +189,8 @@ def _prepare(
         print(algorithm.learns_from)
     if algorithm.schedule:
         say(algorithm.schedule)
+    if config.cost_limits and not is_to_keep_limits(config):
+        say(f"algo={config.algo.name} does not keep cost_limits: they are only reported.")
     if continues and trainer.resume():
         print(f"Resuming after {trainer.progress.steps:,} of {config.frames:,} frames.")
         if trainer.snapshot is None:

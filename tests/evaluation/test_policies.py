@@ -81,7 +81,7 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
 
 def test_an_option_of_an_export_is_checked(run, tmp_path, capsys):
     assert export([str(run), str(tmp_path / "packed"), "actions=meen"]) == 1
-    assert "actions=meen: it must be '', 'mean' or 'sampled'" in capsys.readouterr().err
+    assert "actions=meen: it must be 'mean' or 'sampled'" in capsys.readouterr().err
     assert not (tmp_path / "packed").exists()
 
 
@@ -104,6 +104,9 @@ def test_an_export_that_was_killed_can_be_repeated(run, tmp_path, monkeypatch):
             policies.pack_policy(run, packed, "last")
     (packed / ".policy.0123456789abcdef.json").touch()  # of one that was killed still earlier
     assert policies.pack_policy(run, packed, "last").is_file()
+    (packed / "evaluation.json").write_text("{}")  # of the policy that was there before
+    policies.pack_policy(run, packed, "last")
+    assert not (packed / "evaluation.json").exists()
 
 
 @pytest.mark.parametrize("path", sorted(policies.POLICIES.glob("*/certificate.json")), ids=str)

@@ -228,6 +228,8 @@ def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_
     table = final_table(experiments)
     found = dict(zip((r["algorithm"] for r in table.records), marks(table, "$J_r$"), strict=True))
     assert [name for name, mark in found.items() if mark] == ["PPO-Lagrangian", "TRPO-Lagrangian"]
+    kept = {r["algorithm"]: r["satisfies"] for r in table.records}
+    assert (kept["CPO"], kept["PPO-Lagrangian"], kept["mine"]) == (None, True, False)
     own = [[e] for e in experiments if e.algorithm in ("CPO", "PPO-Lagrangian", "mine")]
     assert marks(slate_table("SG6", own), r"$\bar M_c$") == ["", "", "bad"]
 
