@@ -132,7 +132,7 @@ class WorkerCollector:
         """Start the workers and collect without end.
 
         Raises:
-            WorkerError: If a worker has died.
+            WorkerError: If a worker has died, or could not begin.
         """
         others = set(active_children())
         try:
@@ -144,6 +144,11 @@ class WorkerCollector:
                 process.kill()
             clear_frames(error.__traceback__)
             gc.collect()
+            if "failed to initialize and closed" in str(error):
+                raise WorkerError(
+                    "A worker could not begin; what it says is above. A script of yours that "
+                    'trains with workers does so below `if __name__ == "__main__":`.'
+                ) from error
             raise
         batches = iter(self._workers)
         while True:

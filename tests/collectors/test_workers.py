@@ -206,7 +206,7 @@ def test_a_worker_in_trouble_while_it_starts_ends_the_run_with_the_reason(tmp_pa
     path = [os.path.dirname(file) for file in (__file__, point_mass.__file__)]
     script.write_text(SCRIPT.format(path=path))
     said = in_a_process(str(script), status=1)
-    assert "failed to initialize and closed the connection" in said
+    assert "A worker could not begin; what it says is above." in said
     assert "too many worlds" in said
 
 

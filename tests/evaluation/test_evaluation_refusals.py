@@ -98,7 +98,10 @@ def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
     shutil.rmtree(run / "checkpoints" / "best")
     assert main([str(run), "checkpoint=best"]) == 1
     error = capsys.readouterr().err
-    assert "no epoch kept every cost limit, with estimate_<cost> ≤ target_<cost>. Use checkpoint=last" in error
+    assert (
+        "no epoch kept every cost limit, with estimate_<cost> ≤ target_<cost>. Use checkpoint=last"
+        in error
+    )
 
 
 def test_of_mappings_only_what_is_named_changes():
