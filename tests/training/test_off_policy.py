@@ -256,14 +256,19 @@ def test_what_is_held_against_the_limit_is_the_mean_of_the_worst_episodes(make_t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", ["sac_lagrangian", "td3_lagrangian"])
-def test_it_learns_to_go_around_a_hazard(algo, tmp_path):
+@pytest.mark.parametrize(
+    ("algo", "words"),
+    # the policy of TD3 is deterministic: with some other seeds it stays on the straight way
+    [("sac_lagrangian", []), ("td3_lagrangian", ["lagrangian.ki=0.2"])],
+)
+def test_it_learns_to_go_around_a_hazard(algo, words, tmp_path):
     """The origin is 1.2 away and the hazard on the straight way, of which five steps lie in it."""
     config = off_policy_config(
         *(f"algo={algo}", "frames=24_000", "frames_per_batch=400", "cost_limits={cost: 1}"),
         *("policy_update.updates_per_step=0.2", "limits.free_steps=6000"),
         *("limits.descent_steps=6000", "exploration.random_steps=800", "memory.keep=false"),
         *("model.hidden_sizes=[64, 64]", "memory.batch_size=128"),
+        *words,
     )
     trainer_of(config, tmp_path).run()
     table = read_table(tmp_path / "progress.csv")
