@@ -71,7 +71,11 @@ def import_later(
     def find(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(import_module(modules[name]), name)
+        try:
+            module = import_module(modules[name])
+        except AttributeError as error:  # Python would say that the name does not exist
+            raise ImportError(f"{modules[name]} cannot be imported: {error!r}") from error
+        return getattr(module, name)
 
     def names() -> list[str]:
         return sorted({*vars(sys.modules[package]), *modules})

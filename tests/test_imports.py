@@ -4,6 +4,8 @@ import pytest
 from commands import ROOT, in_a_process
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
+from safe_rl.extras import import_later
+
 
 def test_imports_point_one_way():
     assert lint_imports(str(ROOT / ".importlinter"), no_cache=True) == EXIT_STATUS_SUCCESS
@@ -75,3 +77,13 @@ def test_help_and_configurations_are_shown_without_importing_what_trains(command
     )
     assert words in said
     assert said.splitlines()[-1] == "slow: set()"
+
+
+def test_a_part_that_cannot_be_imported_is_not_taken_for_a_missing_name(tmp_path, monkeypatch):
+    """As MuJoCo raises an AttributeError if MUJOCO_GL names a library that is not there."""
+    (tmp_path / "late").mkdir()
+    (tmp_path / "late/part.py").write_text("None.gl")
+    monkeypatch.syspath_prepend(tmp_path)
+    find, _ = import_later("late", {"part": ["name"]})
+    with pytest.raises(ImportError, match=r"^late\.part cannot be imported: .*no attribute 'gl'"):
+        find("name")
