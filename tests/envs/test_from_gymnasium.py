@@ -1,6 +1,7 @@
 """Environments that are not ours, with costs in `info`, in TorchRL and under our algorithms."""
 
 import copy
+import functools
 import warnings
 
 import gymnasium
@@ -138,6 +139,22 @@ def test_an_entry_of_a_name_with_another_meaning_is_refused(name):
     wrong = type("Wrong", (Counter,), {"observation_space": space})
     with pytest.raises(ConfigError, match=f"an entry '{name}': rename it"):
         from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=False)
+
+
+def test_observed_choices_that_begin_at_another_number_are_refused_unless_flattened():
+    class FromOne(Counter):
+        observation_space = gymnasium.spaces.Dict(n=gymnasium.spaces.Discrete(3, start=1))
+
+        def reset(self, **options):
+            return {"n": 3}, super().reset(**options)[1]
+
+        def step(self, action):
+            return {"n": 2}, *super().step(action)[1:]
+
+    make = functools.partial(from_gymnasium, FromOne, num_envs=1, num_steps=3, seed=0)
+    assert make().rollout(1)["observation"][0, 0].tolist() == [0.0, 0.0, 1.0]
+    with pytest.raises(ConfigError, match=r"Discrete\(3, start=1\) is observed: set flatten=true"):
+        make(flatten=False)
 
 
 def test_a_sum_of_costs_in_info_is_the_cost_and_no_kind_of_its_own():

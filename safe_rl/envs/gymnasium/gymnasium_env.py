@@ -42,20 +42,23 @@ def make_adapted(
     """
     env: gymnasium.Env = CheckedSteps(make(), cost_keys, watch)
     seen, actions = env.observation_space, env.action_space
+    entries = dict(seen) if isinstance(seen, spaces.Dict) else {}
     if flatten:
         env = FlattenObservation(env)
     elif isinstance(seen, spaces.Tuple):
         raise ConfigError("The observation is a Tuple: set flatten=true, which makes one vector.")
-    elif taken := {*_WRITTEN, *cost_keys} & {*(seen if isinstance(seen, spaces.Dict) else ())}:
+    elif taken := {*_WRITTEN, *cost_keys} & {*entries}:
         raise ConfigError(
             f"The observation has an entry '{min(taken)}': rename it, because a step writes one of "
             "this name."
         )
-    elif dotted := [key for key in (seen if isinstance(seen, spaces.Dict) else ()) if "." in key]:
+    elif dotted := [key for key in entries if "." in key]:
         raise ConfigError(
             f"The observation has an entry '{dotted[0]}': rename it, because dots stand between "
             "the names of nested entries."
         )
+    elif shifted := [x for x in (seen, *entries.values()) if np.any(getattr(x, "start", 0))]:
+        raise ConfigError(f"{shifted[0]} is observed: set flatten=true, or let it begin at 0.")
     if isinstance(actions, Discrete | MultiDiscrete) and np.any(actions.start):
         choices = (
             Discrete(actions.n) if isinstance(actions, Discrete) else MultiDiscrete(actions.nvec)
