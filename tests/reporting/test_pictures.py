@@ -68,10 +68,8 @@ def test_the_figures_of_the_paper_show_what_is_missing(tmp_path):
 
 
 def test_every_limited_cost_has_a_row(tmp_path):
-    directory = write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0})
-    path = directory / "progress.csv"
-    head, row = path.read_text().splitlines()
-    path.write_text(f"{head},episode_cost_hazards,cost_hazards_rate\n{row},4,0.004\n")
+    hazards = {"episode_cost_hazards": (4,), "cost_hazards_rate": (0.004,)}
+    write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0}, columns=hazards)
     experiments = experiments_in(tmp_path)
     figure = draw_learning_curves(experiments, algorithm_styles(experiments))
     panels = np.array(figure.axes).reshape(2, 3)
