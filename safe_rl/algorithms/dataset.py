@@ -81,16 +81,16 @@ def _other_environment(config: DictConfig) -> str:
     try:
         there = read_config(Path(config.dataset.path).parent / "config.yaml")
         name = there["env"]["name"]
+        if name != config.env.name:
+            return f" Warning: they are of {name}, and this environment is {config.env.name}."
+        changed = [
+            f"env.{key}"
+            for key, value in there["env"].items()
+            if value is not None and here["env"].get(key, value) not in (value, None)
+        ]
+        before, now = (dict(config.get("transforms") or {}) for config in (there, here))
     except (OSError, ValueError, LookupError, TypeError):  # it is not in a run's folder
         return ""
-    if name != config.env.name:
-        return f" Warning: they are of {name}, and this environment is {config.env.name}."
-    changed = [
-        f"env.{key}"
-        for key, value in there["env"].items()
-        if value is not None and here["env"].get(key, value) not in (value, None)
-    ]
-    before, now = there.get("transforms") or {}, here.get("transforms") or {}
     changed += [f"transforms.{key}" for key in {**before, **now} if before.get(key) != now.get(key)]
     return f" Warning: they are of a run with other {', '.join(changed)}." if changed else ""
 
@@ -107,8 +107,8 @@ def _ignored_transforms(config: DictConfig, *, is_raw: bool, evaluating: bool) -
     if not ignored:
         return ""
     return (
-        f" Warning: transforms=[{','.join(ignored)}] act on what is collected, not on it: its "
-        "observations, rewards and ends are used as they are."
+        f" Warning: transforms=[{','.join(ignored)}] change what the run collects, but not this "
+        "dataset: its observations, rewards and ends are used as they are."
     )
 
 
@@ -208,11 +208,11 @@ def _order_columns(
     if isinstance(spec, Bounded):
         beyond = (seen < spec.low[0].cpu() - 1e-3) | (seen > spec.high[0].cpu() + 1e-3)
         if number := int(beyond.any(0).sum()):
-            other = "need" if columns is None else "alone need"
+            files = "Files" if columns is None else "Only files"
             raise ValueError(
                 f"{number} of the {len(here)} columns of its observations leave the bounds of this "
-                "environment's: their order is another one. Files of Safety-Gymnasium and DSRL "
-                f"{other} dataset.columns=safety_gymnasium; others can name their columns in the "
+                f"environment's: their order is another one. {files} of Safety-Gymnasium and DSRL "
+                "need dataset.columns=safety_gymnasium; others can name their columns in the "
                 f"attribute observation_columns: {here[0]}, …"
             )
     if columns is not None:

@@ -317,4 +317,6 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
     names = " or ".join(f"'{path}'" for path in meant)
     if names:
         return f"there is no key '{key}'. Did you mean {names}?"
-    return f"with this algorithm and environment there is no key '{key}'. '--cfg job' prints all."
+    return (
+        f"with this algorithm and environment there is no key '{key}'. '--cfg job' prints all keys."
+    )

@@ -13,7 +13,9 @@ from torch import Tensor
 from safe_rl.files import load_tensors, printable, read_json, replace_json, save_tensors
 
 INTERFACE = "recording.json"
-"""File of a recording with the ``interface`` of its environment: columns, units of actions."""
+"""File of a recording with the ``interface`` of its environment: columns, units of actions.
+
+``evaluating`` is true in it if an evaluation was recorded, and not a training."""
 PARTIAL = "partial"
 """Entry [N, T, 1] bool, true in at least one step of an episode that is not recorded completely."""
 

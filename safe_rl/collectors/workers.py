@@ -146,8 +146,8 @@ class WorkerCollector:
             gc.collect()
             if "failed to initialize and closed" in str(error):
                 raise WorkerError(
-                    "A worker could not begin; what it says is above. A script of yours that "
-                    'trains with workers does so below `if __name__ == "__main__":`.'
+                    "A worker could not begin; what it says is above. In a script of yours, "
+                    'train with workers only below `if __name__ == "__main__":`.'
                 ) from error
             raise
         batches = iter(self._workers)

@@ -111,7 +111,7 @@ def is_cost(name: Any) -> bool:
     return name == COST or str(name).startswith(f"{COST}_")
 
 
-#: What such names usually mean is no cost of a step: users who mean one write it in `cost_keys`.
+#: These names usually mean something else than the cost of a step. `cost_keys` can still name them.
 _NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", "total", "return")}
 
 

@@ -178,7 +178,7 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
     table = read_table(folder.table_file)
     with _noted(folder.table_file, skipped):
         if not read_bounded(folder.table_file, _MOST_BYTES).endswith(b"\n"):
-            raise ValueError("its last line has no end (yet), and is not read")
+            raise ValueError("its last line does not end with a line break, and is not read")
     before = select(read(folder.composed_file), "frames")
     notes = {
         "overrides": read(folder.overrides_file),

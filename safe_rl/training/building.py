@@ -149,7 +149,7 @@ def _other_actions(known: Any, here: Mapping[str, Any]) -> Iterator[str]:
     """Warnings if actions meant something else where a policy was trained, by two `interface`s."""
     key, known = "steps_per_decision", known if isinstance(known, dict) else {}
     if known.get(key, here[key]) != here[key]:
-        yield f"Warning: an action of init_from lasts {known[key]} steps, and here {here[key]}."
+        yield f"Warning: an action of init_from lasts {known[key]} step(s), and here {here[key]}."
     both = (known.get("actions"), here["actions"])
     bounds = [[a.get("own_low"), a.get("own_high")] for a in both if isinstance(a, dict)]
     if len(bounds) == 2 and bounds[0] != bounds[1]:

@@ -185,7 +185,7 @@ def test_columns_are_taken_by_their_names(tmp_path):
 
     check(tmp_path / "own.hdf5", "dataset.columns=safety_gymnasium")
     write_episodes(tmp_path / "ours.hdf5", "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
-    with pytest.raises(ValueError, match="and DSRL alone need dataset"):
+    with pytest.raises(ValueError, match="Only files of Safety-Gymnasium and DSRL need dataset"):
         learned(tmp_path / "ours.hdf5", env, "dataset.columns=safety_gymnasium")
     (tmp_path / "own.hdf5").rename(tmp_path / "SafetyPointGoal1Gymnasium-v0-65-2022.hdf5")
     with pytest.raises(ValueError, match=r"is of SafetyPointGoal1Gymnasium-v0, whose columns"):
@@ -256,7 +256,7 @@ def test_a_file_without_names_is_used_with_a_warning(tmp_path):
     assert "transforms" not in told
     scale = "+transforms.scale={_target_: torchrl.envs.RewardScaling, loc: 0, scale: 0.01}"
     told = learner(path, env, *words, scale, name="gymnasium").learns_from
-    assert "Warning: transforms=[scale] act on what is collected, not on it" in told
+    assert "Warning: transforms=[scale] change what the run collects, but not this dat" in told
 
 
 @pytest.mark.long

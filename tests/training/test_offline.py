@@ -107,8 +107,8 @@ def test_keys_and_transforms_that_differ_are_named(tmp_path):
     about = {**PointMass().interface, "evaluating": True}  # of an evaluation: no episode stopped
     (data / "recording.json").write_text(json.dumps(about))
     assert told(transforms=there["transforms"]) == (
-        f"{changed} Warning: transforms=[stop] act on what is collected, not on it: its "
-        "observations, rewards and ends are used as they are."
+        f"{changed} Warning: transforms=[stop] change what the run collects, but not this "
+        "dataset: its observations, rewards and ends are used as they are."
     )
 
 

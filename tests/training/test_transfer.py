@@ -81,7 +81,7 @@ def test_actions_of_another_meaning_are_told(trained, capsys):
         begin_from(fresh, {"init_from": trained.writer.run.directory}, here | changes)
     told = capsys.readouterr().out.splitlines()
     assert told == [
-        "Warning: an action of init_from lasts 1 steps, and here 2.",
+        "Warning: an action of init_from lasts 1 step(s), and here 2.",
         "Warning: actions of init_from have the bounds [[-1.0, -1.0], [1.0, 1.0]], and here "
         "[[-6.0, -6.0], [1.0, 1.0]].",
     ]
