@@ -116,5 +116,10 @@ _NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", "
 
 
 def found_costs(names: Iterable[Any]) -> list[str]:
-    """Names of the costs of a step among those that an environment writes."""
+    """Names of the costs of a step among those that an environment writes.
+
+    Examples:
+        >>> found_costs(["place", "cost", "cost_doors", "cost_limit"])
+        ['cost', 'cost_doors']
+    """
     return [str(name) for name in names if is_cost(name) and name not in _NOT_OF_STEPS]
