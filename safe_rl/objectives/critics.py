@@ -43,6 +43,7 @@ def critic_bias(
     ends[:, -1] = True
     cut = ends & ~terminated
     sums = []
+    # of a prediction of 1 and no costs, the difference is the weight of the step
     for signal, prediction in ((cost, value), (torch.zeros_like(value), torch.ones_like(value))):
         # at a cut, later costs are taken to agree with the prediction
         signal = torch.where(cut, prediction, signal)

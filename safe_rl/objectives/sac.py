@@ -205,6 +205,7 @@ class CALLoss(SACLagrangianLoss):
 
     def cost_weights(self, values: Tensor) -> Tensor:
         """λ̂ / u, [k]; also adds the critics' mean predictions to the sums for `prepare`."""
+        # here, because the values are computed for each update of the policy anyway
         means = self.cost_values.mean(values).flatten(0, -2).mean(0).to(self.predicted_costs)
         self.predicted_costs.add_(torch.stack([means, torch.ones_like(means)]))
         expected = self.cost_of(values).flatten(0, -2).mean(0)

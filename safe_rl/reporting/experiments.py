@@ -176,7 +176,8 @@ def _settings_of_names(
     """Folder -> the settings in the name of its run.
 
     These are settings that differ between runs of the algorithm, and that a user has set. If they
-    do not distinguish all experiments on an environment, all settings that differ are used there.
+    do not distinguish all experiments on an environment, such as runs from two versions of a
+    default, all settings that differ are used there.
     """
     named: dict[Path, Settings] = {}
     by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))

@@ -71,7 +71,8 @@ class Run:
 
     def __init__(self, directory: Path | str, **contents: Any) -> None:
         self.directory = Path(directory)
-        vars(self).update(contents)  # found before the cached properties of these names
+        # cached properties that are known already, as those of an archived run, which has no files
+        vars(self).update(contents)
 
     # files
 
