@@ -220,8 +220,9 @@ def check_cost_limits(
         if key not in cost_keys:
             raise ValueError(
                 f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}; in Safety "
-                "Gym's environments env.constrain_<kind>=true adds those of another kind."
+                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}. Safety Gym's "
+                "environments get others by env.constrain_<kind>=true; those that a first step of "
+                "Gymnasium's does not report are named by env.cost_keys=[…]."
             )
         limits[key] = float(limit)
     return limits

@@ -106,8 +106,11 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
         if word.startswith("transforms=[") and len(set(names)) < len(names):
             raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
     choices = hydra.runtime.choices
+    _refuse_hidden_files(choices, hydra.runtime.config_sources)
     if "algo" in choices:
         config.algo.name = choices["algo"].rpartition("/")[2]
+    if "name" not in config.env:
+        raise ValueError(f"env={choices.get('env')}: its file needs a line 'name: …'.")
     name, chosen = config.env.name, choices.get("env")
     if chosen is None or name == chosen:
         return
@@ -117,6 +120,20 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
             f"env.name={name} would train env={chosen} under the name of another environment. To "
             f"choose that one, write env={name}."
         )
+
+
+def _refuse_hidden_files(choices: Mapping[str, Any], sources: Iterable[Any]) -> None:
+    """Refuse a file of the user's that Hydra does not read, as another one has its name."""
+    folders = [Path(source.path) for source in sources if source.schema == "file"]
+    for group, chosen in choices.items():
+        for name in [chosen] if isinstance(chosen, str) else chosen or ():
+            files = [folder / group.partition("@")[0] / f"{name}.yaml" for folder in folders]
+            found = list(dict.fromkeys(file.resolve() for file in files if file.is_file()))
+            if found[1:]:
+                raise ValueError(
+                    f"{group}={name}: {found[1]} would have no effect, because there is "
+                    f"{found[0]}. Give the file another name."
+                )
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -167,6 +184,9 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     foreign = re.search(r"(?s)In '(\S+)': .*Key '\S+' not in '(\S+)'\s+full_key: (\S+)", str(error))
     if foreign:
         return _foreign_key(*foreign.groups())
+    taken = re.match(r"'(\w+)/(\S+)' is validated against ConfigStore schema", str(error))
+    if taken:
+        return f"{taken[1]}={taken[2]}: the package has one of this name. Rename your file."
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
     absent = re.match(r"Missing mandatory value: (\S+)", str(cause or error))
     if absent and absent[1] in General.__annotations__:
@@ -194,7 +214,7 @@ def _unknown_choice(error: MissingConfigException) -> str:
     listed = all_of_them if len(known) <= _MOST_LISTED else f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     hint = hint or did_you_mean("none" if name == "null" else name, known, 0.6)
-    more = f" {listed}; a file of yours needs --config-dir FOLDER."
+    more = f" {listed}; a file of yours needs --config-dir FOLDER, a module import=FILE.py."
     return f"{place}there is no {group} '{name}'.{hint or more}"
 
 
@@ -239,6 +259,16 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     section = key.partition(".")[0]
     if OmegaConf.is_missing(config, section):
         return _absent(section)
+    if section == "env" and "kwargs" in config.env:
+        name = key.removeprefix("env.")
+        hint = did_you_mean(name, map(str, config.env), 0.7)
+        return (
+            f"there is no key '{key}'.{hint} Arguments of the environment's constructor are given "
+            f"as env.kwargs='{{{name}: …}}'."
+        )
+    is_of_own = any(re.match(rf"{section}(\._target_|=.*\b_target_\b)", word) for word in words)
+    if is_of_own and not key.endswith("._target_"):
+        return f"there is no key '{key}'. What a class of yours takes is added: '+{key}=…'."
     return unknown_key(key, keys_of(config))
 
 

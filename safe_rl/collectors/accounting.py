@@ -47,7 +47,9 @@ def check_steps(entries: Mapping[NestedKey, Tensor], cost_keys: Sequence[NestedK
             f"first in {where}. Nothing has been learned from them: look for the environment's "
             "first NaN or infinite number."
         )
-    for key in cost_keys if min(read[len(sums) :], default=0.0) < 0 else ():
+    is_below = min(read[len(sums) :], default=0.0) < 0
+    # the sum of all costs last: it is the environment's doing only through one of the others
+    for key in sorted(cost_keys, key="cost".__eq__) if is_below else ():
         if below := int((entries[key] < 0).sum()):
             raise EpisodeError(
                 f"The cost '{key_name(key)}' is below 0 in {below} of {entries[key].numel()} "
@@ -172,6 +174,8 @@ class EpisodeAccounting(Resumable):
     ) -> None:
         self.longest, self.steps_per_decision = longest, steps_per_decision
         self.cost_keys = list(cost_keys)
+        for key in {"return", "length"} & {key_name(key) for key in self.cost_keys}:
+            raise ValueError(f"A cost cannot be named '{key}': episode_{key} is another column.")
         self.done_key = done_key
         self._signal_keys = [reward_key, *self.cost_keys]
         num_sums = 1 + len(self._signal_keys)
@@ -234,7 +238,8 @@ class EpisodeAccounting(Resumable):
         if self.longest is not None and longest > self.longest:
             raise EpisodeError(
                 f"An episode has {longest:g} steps, but the environment's 'max_episode_steps' is "
-                f"{self.longest}: it has to end episodes itself ('done' and 'truncated')."
+                f"{self.longest}: it has to end episodes itself ('done' and 'truncated'), and its "
+                "reset may only begin episodes in the rows that '_reset' names."
             )
         self.totals += signals.sum((0, 1))
         names = [key_name(key) for key in self.cost_keys]

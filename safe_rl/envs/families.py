@@ -147,7 +147,7 @@ def store_configs(whole: Container[str] | None = None) -> None:
         values = {"_target_": VELOCITY_TARGET, "name": name, **row}
         rows[name] = {key: Key(value, ANNOTATIONS.get(key, str)) for key, value in values.items()}
     for name, family in FOREIGN.items():
-        head = {"_target_": family.target, "name": "${.id}", "id": "???"}
+        head = {"_target_": family.target, "name": "${safe_rl.folder_name:${.id}}", "id": "???"}
         rows[name] = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
     if whole is not None:
         rows = {name: row if name in whole else {} for name, row in rows.items()}

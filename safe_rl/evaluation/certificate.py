@@ -71,8 +71,15 @@ class Certificate:
         head += f" ({episodes}; means of {self.further} further episodes; at {after}):"
         return "\n".join([head, *rows, self._not_covered_text()])
 
+    @property
+    def has_bounds(self) -> bool:
+        """Whether the costs were those that the environment's specs allow."""
+        return all(math.isfinite(bound) for bound, _ in self.verdict.bounds.values())
+
     def _bound_text(self, name: str) -> str:
         bound, limit = self.verdict.bounds[name]
+        if math.isinf(bound):
+            return f"{name} has no bound: an episode cost more than the environment's specs allow"
         why = " by construction" if name in self.verdict.by_construction else ""
         return f"{name} ≤ {rounded_up(bound):.3g}{why}, limit {limit:g}"
 

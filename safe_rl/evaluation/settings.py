@@ -117,6 +117,12 @@ def check_options(options: EvaluationOptions) -> None:
         raise ValueError(f"picture={options.picture}: there is no folder {folder}.")
 
 
+def has_tested_measure(config: DictConfig) -> bool:
+    """Whether a certificate can be about what is limited: not a risk measure of the user's own."""
+    target = OmegaConf.select(config, "risk._target_")
+    return target is None or str(target).startswith("safe_rl.")
+
+
 def certificate_options(
     config: DictConfig, changes: Mapping[str, Any] | None = None
 ) -> CertificateOptions:
@@ -137,6 +143,7 @@ def certificate_options(
     if not options["episodes"]:  # training was to end without a certificate
         options["episodes"] = OmegaConf.load(CONF / "config.yaml").certificate.episodes
     # with risk=mean the section may still have numbers, such as the tail of WCSAC's critics
-    risk = config.risk if OmegaConf.select(config, "risk._target_") else {}
+    is_measured = OmegaConf.select(config, "risk._target_") and has_tested_measure(config)
+    risk = config.risk if is_measured else {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
     return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))

@@ -98,6 +98,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         *,
         params: TensorDictBase | None = None,
         target_params: TensorDictBase | None = None,
+        time_dim: int | None = None,
     ) -> TensorDictBase:
         """Write values, advantages and value targets into a rollout; they are 0 in padding.
 
@@ -105,6 +106,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
             tensordict: Rollout [..., T] with `in_keys`, or these entries as keyword arguments.
             params: Parameters to run the value network with instead of its own.
             target_params: Must be None; a single pass has a single set of parameters.
+            time_dim: Dimension of time; None: the one that has the name ``"time"``, or the last.
 
         Raises:
             KeyError: If an entry is missing.
@@ -112,7 +114,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
                 between time and the signals, or if `target_params` is given.
         """
         keys = self.tensor_keys
-        value, advantage, target = self._estimate(tensordict, params, None, target_params)
+        value, advantage, target = self._estimate(tensordict, params, None, target_params, time_dim)
         tensordict.set(keys.value, value)
         tensordict.set(keys.advantage, advantage)
         return tensordict.set(keys.value_target, target)
@@ -134,8 +136,16 @@ class VectorGAE(Checked, ValueEstimatorBase):
         params: TensorDictBase | None,
         next_value: Tensor | None,
         target_params: TensorDictBase | None,
+        time_dim: int | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Value, advantage and value target, [..., T, F] each."""
+        time = self._get_time_dim(time_dim, tensordict)
+        if time != tensordict.ndim - 1:
+            following = None if next_value is None else next_value.transpose(time, -2)
+            rows = tensordict.transpose(time, -1)
+            estimates = self._estimate(rows, params, following, target_params, -1)
+            value, advantage, target = (each.transpose(time, -2) for each in estimates)
+            return value, advantage, target
         if target_params is not None:
             raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys

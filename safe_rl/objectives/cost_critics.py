@@ -16,6 +16,7 @@ from safe_rl.objectives.critics import critic_bias
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
+from safe_rl.objectives.samples import sample_mask
 
 
 class CostCritics(QFunctionLoss):
@@ -132,8 +133,9 @@ class CostCritics(QFunctionLoss):
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
         self.cost_unit.copy_(limits.unit)
-        rewards = batch.get(("next", self.tensor_keys.reward)).detach().flatten()
-        rewards = rewards.to(self.reward_sums)
+        mask = sample_mask(batch, self)
+        rewards = batch.get(("next", self.tensor_keys.reward)).detach()
+        rewards = (rewards if mask is None else rewards[mask]).flatten().to(self.reward_sums)
         powers = torch.stack([torch.ones_like(rewards), rewards, rewards.square()])
         self.reward_sums.add_(powers.sum(-1))
         number, total, squares = self.reward_sums
@@ -166,7 +168,7 @@ class CostCritics(QFunctionLoss):
         self, objective: Tensor, tensordict: TensorDictBase, action: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The actor's loss [...] with the cost penalty, and diagnostics."""
-        if not self._is_prepared:
+        if not self._is_prepared and not self.reward_sums[0]:  # nor restored from a state
             raise ValueError(
                 f"{type(self).__name__} does not know the scales of costs and rewards: call "
                 "prepare(batch, limits) with every batch, before its updates."

@@ -137,7 +137,7 @@ class CriticLoss(SharesTensors):
         network, params = getattr(self, name), getattr(self, f"{name}_params")
         target = require(tensordict, target_key, "VectorGAE and CostGAE write value targets.")
         with params.to_module(network, preserve_module_state=False):
-            value = network(tensordict.select(*network.in_keys)).get(value_key)
+            value = require(network(tensordict.select(*network.in_keys)), value_key)
         if value.shape != target.shape:
             raise ValueError(
                 f"{value_key!r} has shape {tuple(value.shape)} but {target_key!r} has "
@@ -214,6 +214,9 @@ class ActorCriticLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Evaluate both losses on a batch of any shape."""
+        for name in {"reduction", "_loss_mask_key"} & vars(self).keys():  # set by the user
+            for part in (self.policy_loss, self.critic_loss):
+                setattr(part, name, getattr(self, name))
         critic = self.critic_loss(tensordict).items()
         weighed = {
             name: self.critic_coeff * value if name.startswith("loss_") else value

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from pydantic import NonNegativeFloat
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor
 from torch.nn.functional import mse_loss
@@ -149,6 +151,15 @@ class BCLoss(ReplayLoss):
         ['observation', 'action']
     """
 
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that `set_keys` accepts."""
+
+        action: NestedKey = "action"  # of the recorded action, [..., A]; as the policy writes it
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
     actor_network: TensorDictModuleBase
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
@@ -162,8 +173,13 @@ class BCLoss(ReplayLoss):
                 f"{actor_network.out_keys}."
             )
         self.convert_to_functional(actor_network, "actor_network")
-        self.in_keys = [*actor_network.in_keys, *actor_network.out_keys]
+        self.set_keys(action=actor_network.out_keys[0])
         self.out_keys = ["loss_actor"]
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the steps that are read."""
+        return [*self.actor_network.in_keys, self.tensor_keys.action]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -173,7 +189,7 @@ class BCLoss(ReplayLoss):
             KeyError: If an entry is missing; the message names it.
         """
         (key,) = self.actor_network.out_keys
-        taken = require(tensordict, key)
+        taken = require(tensordict, self.tensor_keys.action)
         inputs = tensordict.select(*self.actor_network.in_keys)
         with self.actor_network_params.to_module(self.actor_network):
             chosen = self.actor_network(inputs).get(key)

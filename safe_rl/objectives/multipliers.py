@@ -100,7 +100,7 @@ class Multiplier(Checked, nn.Module, ABC):
         multiplier of this cost and its state do not change.
 
         Raises:
-            ValueError: If there is not one limit per cost.
+            ValueError: If there is not one limit per cost, or λ falls below 0.
         """
         if state.violation.shape != (self.num_costs,):
             raise ValueError(
@@ -112,6 +112,11 @@ class Multiplier(Checked, nn.Module, ABC):
         for name, new in self._step(state).items():
             buffer = self.get_buffer(name)
             buffer.copy_(torch.where(known, new, buffer))
+        if (self.value < 0).any():
+            raise ValueError(
+                f"{type(self).__name__}: λ must not be below 0, where costs would be rewarded; got "
+                f"{self.value.tolist()}."
+            )
 
     @abstractmethod
     def _step(self, state: LimitState) -> dict[str, Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
@@ -173,13 +173,28 @@ class QFunctionLoss(ReplayLoss):
         network, or its own without gradients (``"frozen"``).
         """
         network: Ensemble = getattr(self, name)
+        params = f"{'target_' if kind == 'target' else ''}{name}_params"
+
+        def arrange() -> Any:
+            values = getattr(self, params)
+            return network.layers(values.data if kind == "frozen" else values)
+
+        layers = self.cached((name, kind), params, arrange)
+        entries = [require(steps, key) for key in network.in_keys[:-1]]
+        return network.values(entries, action, layers)
+
+    def cached(self, key: Hashable, params: str, compute: Callable[[], Any]) -> Any:
+        """What is computed from the parameters `params`, once for as long as they are there.
+
+        Others take their place in ``with others.to_module(loss)``, and if the attribute is set.
+        """
         # TorchRL clears this cache whenever parameters move to another device or dtype
         cache = self.__dict__.setdefault("_cache", {})
-        if (name, kind) not in cache:
-            params = getattr(self, f"{'target_' if kind == 'target' else ''}{name}_params")
-            cache[name, kind] = network.layers(params.data if kind == "frozen" else params)
-        entries = [require(steps, key) for key in network.in_keys[:-1]]
-        return network.values(entries, action, cache[name, kind])
+        source = getattr(self._modules.get(params), "_param_td", None)
+        known, value = cache.get(key, (None, None))
+        if known is None or known is not source:
+            cache[key] = source, (value := compute())
+        return value
 
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """An entry below ``next`` that holds one number per step, [..., 1]."""

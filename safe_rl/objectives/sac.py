@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Annotated, Any, Literal
 
 import torch
@@ -82,7 +83,17 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         with set_exploration_type(ExplorationType.RANDOM):
             # a copy, because the policy writes its distribution's parameters into its input
             inputs = steps.select(*self.actor_network.in_keys)
-            return rsample_and_log_prob(self.actor_network.get_dist(inputs))
+            # entering the functional call takes longer than the network
+            is_own = self.cached("actor", "actor_network_params", self._has_own_actor)
+            with (
+                nullcontext() if is_own else self.actor_network_params.to_module(self.actor_network)
+            ):
+                return rsample_and_log_prob(self.actor_network.get_dist(inputs))
+
+    def _has_own_actor(self) -> bool:
+        """Whether the policy's module has the parameters of the loss, not others in their place."""
+        there = {id(value) for value in self.actor_network_params.values(True, True)}
+        return all(id(parameter) in there for parameter in self.actor_network.parameters())
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Losses of the policy and of α, and diagnostics."""
@@ -208,7 +219,7 @@ class CALLoss(SACLagrangianLoss):
         # here, because the values are computed for each update of the policy anyway
         means = self.cost_values.mean(values).flatten(0, -2).mean(0).to(self.predicted_costs)
         self.predicted_costs.add_(torch.stack([means, torch.ones_like(means)]))
-        expected = self.cost_of(values).flatten(0, -2).mean(0)
+        expected = self.cost_of(values).reshape(-1, values.shape[-1]).mean(0)
         excess = (expected - self.discounted_limit) / self.cost_unit
         weight = self.multiplier.value.to(excess) + self.convexity * excess
         return weight.clamp_min(0) / self.cost_unit

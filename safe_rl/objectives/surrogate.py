@@ -8,7 +8,11 @@ from typing import Any
 import torch
 from pydantic import NonNegativeFloat
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    dispatch,
+)
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -83,7 +87,9 @@ class SurrogateLoss(Checked, SharesTensors):
         self.multiplier: Multiplier | None = None
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
         sampler = sampler_of(actor_network)
-        if len(sampler.dist_sample_keys) > 1:
+        kind = getattr(sampler, "distribution_class", None)
+        is_composite = getattr(kind, "func", kind) is CompositeDistribution
+        if is_composite or len(sampler.dist_sample_keys) > 1:
             raise TypeError(
                 f"actor_network samples {sampler.dist_sample_keys}: losses take policies that "
                 "sample one entry, so no composite distributions. Join the parts of the action."

@@ -272,7 +272,9 @@ def _test(
         tested=[],
         bounds=bounds,
         shortfalls=missing,
-        by_construction=[s.name for s in statements if s.is_by_construction],
+        by_construction=[
+            s.name for s in statements if s.is_by_construction and s.name not in missing
+        ],
         highest=dict(claim.highest),
         episodes=number,
     )

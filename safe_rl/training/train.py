@@ -26,11 +26,11 @@ from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.certificate import has_options
 from safe_rl.evaluation.certifying import certify_run
 from safe_rl.evaluation.loading import keep_robot, node_of
-from safe_rl.evaluation.settings import certificate_options
+from safe_rl.evaluation.settings import certificate_options, has_tested_measure
 from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError, checkpoint_steps, lock_folder
-from safe_rl.runs.identity import is_to_keep_limits
+from safe_rl.runs.identity import is_to_keep_limits, measure_of
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableError
 from safe_rl.training.building import begin_from, build_run, seed_everything
@@ -254,6 +254,13 @@ def certify_finished(
     has_same_options = is_unchanged or has_options(certificate, certificate_options(config))
     if not steps or (is_tested and has_same_options):
         return
+    if not has_tested_measure(config):
+        say(
+            f"Not certified: there is no test for limits on {measure_of(config)}. For a "
+            "certificate of the mean cost: safe-rl evaluate "
+            f"{quote(str(run.directory))} certify=true{import_words(config)}"
+        )
+        return
     if steps > config.frames:
         given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
         say(
@@ -271,7 +278,7 @@ def certify_finished(
     except KeyboardInterrupt:
         return end_by(SIGINT, later)
     say(str(result))
-    if result is not None and result.checkpoint is None:
+    if result is not None and result.checkpoint is None and result.has_bounds:
         say(f"To train on: {again} frames={2 * config.frames:_}")
 
 

@@ -13,7 +13,9 @@ from tensordict import TensorDict
 from safe_rl import trust
 from safe_rl.algorithms import Constraints
 from safe_rl.models import make_actor
+from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
+from safe_rl.training.train import certify_finished
 from safe_rl.trust import allow
 
 EXAMPLES = CONF.parent / "examples"
@@ -44,14 +46,18 @@ def test_measured_costs_sum_to_mean_and_semideviation():
 
 
 def test_it_trains_with_several_costs(tmp_path):
-    point_mass_trainer(
+    trainer = point_mass_trainer(
         tmp_path, f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]", "algo=quadratic",
         "risk=semideviation", "cost_limits={cost_hazards: 1, cost_north: 0.5}",
-    ).run()  # fmt: skip
+    )  # fmt: skip
+    trainer.run()
     table = read_table(tmp_path / "progress.csv")
     for key, limit in (("cost_hazards", 1), ("cost_north", 0.5)):
         expected = [estimate - limit for estimate in table[f"estimate_{key}"]]
         assert table[f"violation_{key}"] == pytest.approx(expected, abs=1e-5)
+    run, said = Run(tmp_path), []
+    certify_finished(run, run.config, 25, stopped_by=None, again="", say=said.append)
+    assert said[0].startswith("Not certified: there is no test for limits on UpperSemideviation.")
 
 
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])

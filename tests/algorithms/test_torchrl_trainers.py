@@ -119,3 +119,14 @@ def test_the_command_of_the_example(capsys, monkeypatch):
     trainer = example.main(["--frames=160", "--frames-per-batch=80", "--num-envs=4"])
     assert trainer.collected_frames == 160
     assert capsys.readouterr().out.count("J_r") == 2
+
+
+def test_a_mask_and_a_reduction_are_those_of_both_parts():
+    loss, policy, critics, batch = make_pair(critic_coeff=1.0)
+    batch["kept"] = torch.arange(16) < 9
+    expected = {**policy(batch[:9]), **critics(batch[:9])}
+    loss.loss_mask_key = "kept"
+    for key, value in loss(batch).items():
+        torch.testing.assert_close(value, expected[key], msg=key)
+    loss.loss_mask_key, loss.reduction = None, "none"
+    assert loss(batch)["loss_objective"].shape == loss(batch)["loss_critic"].shape == (16,)

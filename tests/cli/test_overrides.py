@@ -146,6 +146,28 @@ def test_a_risk_measure_is_refused_where_no_limit_is_kept():
             composed(*words)
 
 
+def test_a_file_that_hydra_would_not_read_is_refused(tmp_path):
+    for group, name in (("algo", "p3o"), ("env", "PointGoal1")):
+        (tmp_path / group).mkdir()
+        (tmp_path / group / f"{name}.yaml").write_text("loss: {kappa: 777}\n")
+    with pytest.raises(ValueError, match=r"algo=p3o: \S+p3o.yaml would have no effect, because"):
+        composed(f"--config-dir={tmp_path}", "algo=p3o", "env=CarGoal1")
+    with pytest.raises(ValueError, match=r"env=PointGoal1: the package has one .* Rename"):
+        composed(f"--config-dir={tmp_path}")
+
+
+def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():
+    with pytest.raises(ValueError, match=r"no key 'env.mode'\. Arg.* env\.kwargs='\{mode: …\}'\.$"):
+        composed("env=gymnasium", "env.id=CartPole-v1", "env.mode=x")
+    with pytest.raises(ValueError, match=r"'loss.size'\. What a .* is added: '\+loss.size=…'\.$"):
+        composed("loss._target_=mine.Loss", "loss.size=3")
+
+
+def test_an_id_with_a_namespace_names_one_folder():
+    (config,) = composed("env=gymnasium", "env.id=ALE/Pong-v5")
+    assert config.env.name == config.hydra.run.dir.split("/")[1] == "ALE-Pong-v5"
+
+
 @pytest.mark.parametrize("flag", ["--config-dir=", "hydra.searchpath=[file://"], ids="ab")
 def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
     for group in ("algo", "env"):

@@ -48,6 +48,7 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     def carry_out(number):
         directory = tmp_path / f"seed{number}"
         node = {"job": {"num": number}, "mode": "MULTIRUN", "runtime": {"choices": {}}}
+        node["runtime"]["config_sources"] = []
         node["overrides"] = {"task": []}
         node["runtime"]["output_dir"] = str(directory)
         config = OmegaConf.create({"hydra": node})

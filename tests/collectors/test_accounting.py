@@ -158,6 +158,10 @@ def test_costs_below_0_are_refused_with_their_name():
     with pytest.raises(EpisodeError, match=r"'cost' is below 0 in 2 of 3 steps.*0 or more"):
         accounting.update(steps_of([-1.0, 0.0, -0.5], [False, False, True]))
     accounting.update(steps_of([0.0, 1.0], [False, True]))
+    steps = steps_of([-1.0], [True])
+    steps["next", "cost_own"] = steps["next", "cost"]
+    with pytest.raises(EpisodeError, match="'cost_own' is below 0"):  # of which it is the sum
+        EpisodeAccounting(1, ["cost", "cost_own"]).update(steps)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
@@ -194,3 +198,9 @@ def test_numbers_of_several_agents_are_no_cost_of_a_step():
 def test_steps_come_one_at_a_time_without_a_last_dimension():
     step = {"reward": torch.ones(2, 1), "done": torch.ones(2, 1, dtype=torch.bool)}
     assert EpisodeAccounting(2, []).update(TensorDict({"next": step}, [2, 1])).num_episodes == 2
+
+
+@pytest.mark.parametrize("name", ["return", "length"])
+def test_no_cost_takes_the_column_of_returns_or_lengths(name):
+    with pytest.raises(ValueError, match=f"'{name}': episode_{name} is another column"):
+        EpisodeAccounting(1, ["cost", name])

@@ -10,6 +10,7 @@ import torch
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pictures import MISSING_OPENGL, needs_opengl
+from torchrl.envs import GymEnv
 
 from safe_rl.envs import EXTRAS, SUITE, ConfigError, env_node, make_env
 from safe_rl.envs.velocity import VELOCITY_SUITE
@@ -203,3 +204,11 @@ def test_the_example_of_a_loop_finds_the_costs_of_episodes(capsys):
     first, second = gymnasium_loop.train(num_steps=20, updates=2, limit=-1.0)
     assert second > first >= 0.01
     assert capsys.readouterr().out.count("8 episodes") == 2
+
+
+def test_torchrls_wrapper_makes_them_by_their_ids():
+    """It asks for a frameskip first, and goes on without one if Python says so."""
+    env = GymEnv("Safexp-PointGoal1-v0", config=SHORT)
+    assert env.rollout(5).shape == (3,)
+    with pytest.raises(TypeError, match=r"unexpected .* 'num_steps'\. Keys .* config=\{'num_steps"):
+        gymnasium.make("Safexp-PointGoal1-v0", num_steps=3)

@@ -163,3 +163,19 @@ def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
     torch.testing.assert_close(
         greedy.value_estimate(rollout, next_value=zero), rollout["next", "reward"]
     )
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_time_is_the_dimension_of_that_name(named):
+    critic = make_critic()
+    rollout = make_rollout([])
+    settings = {"gamma": 0.95, "lmbda": 0.9, "value_target": "lambda_return"}
+    turned = rollout.clone().transpose(0, 1).contiguous()
+    turned.names = ["time", None] if named else [None, None]
+    words = {} if named else {"time_dim": 0}
+    rollout = VectorGAE(critic, **settings)(rollout.clone())
+    theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(turned.clone(), **words)
+    found = VectorGAE(critic, **settings)(turned, **words)
+    for key in ("advantage", "value_target", "state_value"):
+        torch.testing.assert_close(found[key], rollout[key].transpose(0, 1))
+    torch.testing.assert_close(found["advantage"], theirs["advantage"], atol=1e-5, rtol=1e-5)

@@ -118,3 +118,18 @@ def test_one_that_cannot_move_is_not_built():
 
     with pytest.raises(TypeError, match=r"Still.*_step"):
         Still({"cost": 25.0})
+
+
+def test_a_multiplier_that_would_reward_costs_is_refused():
+    class Falling(Multiplier):
+        def __init__(self, cost_limits):
+            super().__init__(cost_limits)
+            self.register_buffer("penalty", torch.zeros(1))
+
+        def _step(self, state):
+            return {"penalty": self.penalty + 0.1 * state.violation}
+
+    multiplier = Falling({"cost": 25.0})
+    multiplier.update(limit_state(5.0))
+    with pytest.raises(ValueError, match=r"Falling: λ must not be below 0, .* got \[-0\.5"):
+        multiplier.update(limit_state(-10.0))

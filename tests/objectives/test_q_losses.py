@@ -342,9 +342,12 @@ def test_an_entry_of_another_shape_is_named_with_the_shape_that_it_must_have(kin
 def test_steps_get_their_priority_alone_and_what_stands_in_the_padding_does_not_matter(kind):
     loss, steps, found = make_loss(kind, lagrange(1.0, 1.0)), make_steps(), []
     steps["collector", "mask"] = torch.arange(6) < 4
-    loss.register_buffer("discounted_limit", torch.zeros(2))  # of CAL
     for value in (0.0, 9.0):
         steps["observation"][4:] = value
+        steps["next", "reward"][4:] = value
+        loss.reward_sums.zero_()
+        loss.prepare(steps, limit_state(0.0, 0.0, unit=[1.0, 1.0]))
+        loss.register_buffer("discounted_limit", torch.zeros(2))  # of CAL
         torch.manual_seed(1)
         found.append(loss(given := steps.clone()).to_dict())
     torch.testing.assert_close(*found)
@@ -362,3 +365,43 @@ def test_the_bias_of_critics_of_costs_that_never_end(kind):
     # half a cost per step is worth 5 at a discount of 0.9; the critics say 6 and 2
     found = loss.cost_bias(steps.reshape(2, 50))
     torch.testing.assert_close(found, torch.tensor([1.0, -3.0]))
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_parameters_in_place_of_its_own_are_used_and_no_longer_than_they_are_there(kind):
+    loss, fresh, steps = (
+        *(make_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)),
+        make_steps(),
+    )
+
+    def found(module):
+        torch.manual_seed(1)
+        return module(steps.clone())["loss_qvalue"].detach()
+
+    before, expected = found(loss), found(fresh)
+    for warm in (True, False):  # whether the loss has been called with its own ones
+        loss = loss if warm else copy.deepcopy(loss)
+        with TensorDict.from_module(fresh).data.to_module(loss):
+            torch.testing.assert_close(found(loss), expected)
+        torch.testing.assert_close(found(loss), before)
+    assert (before - expected).abs() > 1e-4
+    loss(steps.clone())["loss_qvalue"].backward()
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_a_new_loss_with_the_state_of_another_one_needs_no_batch(kind):
+    make_own, kinds = make_loss(kind, lagrange(1.0, 1.0)), make_loss(kind, lagrange(1.0, 1.0))
+    told(make_own, [2.0, 3.0], rewards=[1.0, 2.0])
+    kinds._is_prepared = False
+    kinds.load_state_dict(make_own.state_dict())
+    steps, found = make_steps(), []
+    for loss in (make_own, kinds):
+        torch.manual_seed(1)
+        found.append(loss(steps.clone()).to_dict())
+    torch.testing.assert_close(*found)
+
+
+def test_steps_without_a_batch_dimension():
+    for kind in ("sac", "td3", "cal"):
+        loss = make_loss(kind, lagrange(1.0, 1.0))
+        assert loss(make_steps()[0])["loss_actor"].isfinite()

@@ -230,6 +230,10 @@ def test_the_loss_is_the_mean_squared_difference():
     assert all(p.grad is not None for p in actor.parameters())
     with pytest.raises(KeyError, match="action"):
         BCLoss(actor)(steps.exclude("action"))
+    moved = BCLoss(actor)
+    moved.set_keys(action=("expert", "action"))
+    steps["expert", "action"] = steps.pop("action")
+    torch.testing.assert_close(moved(steps)["loss_actor"], loss)
     with pytest.raises(ValueError, match=r"deterministic.*, not \['loc', 'scale'"):
         BCLoss(make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
 
