@@ -12,44 +12,23 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
-# packages that people import from: each has a page, by its `__all__`
-API = {
-    "safe_rl": "In notebooks and scripts",
-    "safe_rl.envs": "Environments",
-    "safe_rl.envs.extending": "Adding to environments",
-    "safe_rl.envs.transforms": "Transforms",
-    "safe_rl.envs.velocity": "Velocity limits",
-    "safe_rl.objectives": "Losses, advantages, multipliers, limits",
-    "safe_rl.objectives.cpo_dual": "CPO's dual",
-    "safe_rl.objectives.trust_region": "Trust regions, Fisher-vector products",
-    "safe_rl.objectives.risk": "Risk measures",
-    "safe_rl.algorithms": "Algorithms, updates, steps",
-    "safe_rl.models": "Networks",
-    "safe_rl.collectors": "Collection and accounting",
-    "safe_rl.evaluation": "Evaluation and certificates",
-    "safe_rl.scores.certificate": "Claims and their bounds",
-    "safe_rl.scores.comparisons": "Intervals",
-    "safe_rl.reporting": "Reports",
-    "safe_rl.runs.table": "Tables of runs",
-}
 
 
 def on_config(config: MkDocsConfig) -> None:
     """Complete the navigation by the algorithms' pages, each by its heading, and the API."""
     sections = {name: pages for entry in config.nav or [] for name, pages in entry.items()}
-    listed = str(sections["Algorithms"])
     for path in sorted((ROOT / "docs" / "algorithms").glob("*.md")):
-        if f"algorithms/{path.name}" not in listed:
+        if f"algorithms/{path.name}" not in str(sections["Algorithms"]):
             heading = re.search(r"^# (.+)$", path.read_text(), re.M)[1]  # type: ignore[index]
             sections["Algorithms"].append({f"{path.stem}: {heading}": f"algorithms/{path.name}"})
-    sections["API"] += [{module: f"api/{module}.md"} for module in API]
+    sections["API"] += [{module: f"api/{module}.md"} for module in links.API]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
     """Add the pages of the API, and those of files elsewhere."""
-    rows = "".join(f"| [`{m}`]({m}.md) | {what} |\n" for m, what in API.items())
+    rows = "".join(f"| [`{m}`]({m}.md) | {what} |\n" for m, what in links.API.items())
     made = {"api/index.md": f"# API\n\n| import from | for |\n|---|---|\n{rows}"}
-    made |= {f"api/{module}.md": f"# {module}\n\n::: {module}\n" for module in API}
+    made |= {f"api/{module}.md": f"# {module}\n\n::: {module}\n" for module in links.API}
     made |= {page: links.read_page(ROOT / source) for page, source in links.PAGES.items()}
     for uri, content in made.items():
         files.append(File.generated(config, uri, content=content))

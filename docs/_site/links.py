@@ -19,6 +19,26 @@ PAGES = {
     "contributing.md": "CONTRIBUTING.md",
     "first_steps.md": "examples/first_steps.ipynb",
 }
+# packages that people import from: each has a page, by its `__all__`
+API = {
+    "safe_rl": "In notebooks and scripts",
+    "safe_rl.envs": "Environments",
+    "safe_rl.envs.extending": "Adding to environments",
+    "safe_rl.envs.transforms": "Transforms",
+    "safe_rl.envs.velocity": "Velocity limits",
+    "safe_rl.objectives": "Losses, advantages, multipliers, limits",
+    "safe_rl.objectives.cpo_dual": "CPO's dual",
+    "safe_rl.objectives.trust_region": "Trust regions, Fisher-vector products",
+    "safe_rl.objectives.risk": "Risk measures",
+    "safe_rl.algorithms": "Algorithms, updates, steps",
+    "safe_rl.models": "Networks",
+    "safe_rl.collectors": "Collection and accounting",
+    "safe_rl.evaluation": "Evaluation and certificates",
+    "safe_rl.scores.certificate": "Claims and their bounds",
+    "safe_rl.scores.comparisons": "Intervals",
+    "safe_rl.reporting": "Reports",
+    "safe_rl.runs.table": "Tables of runs",
+}
 _LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?!\w+:|#|/)(?P<path>[^)\s#]+)(?P<rest>#[^)\s]*)?\)")
 
 
@@ -29,7 +49,8 @@ def rewrite(text: str, page: str, root: Path) -> str:
 
     def led(match: re.Match[str]) -> str:
         path = os.path.normpath(source.parent / match["path"])
-        target = page_of.get(path)
+        module = path.removesuffix(".py").replace("/", ".")
+        target = page_of.get(path, f"api/{module}.md" if module in API else None)
         if page in PAGES and path.startswith("docs/"):
             target = path.removeprefix("docs/")
         if target is not None:
