@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
-UNEXPECTED = "This happened during training: no setting is wrong, but perhaps a part of your own."
+UNEXPECTED = "This happened during training. If you have parts of your own, look there first."
 """Note of an error whose traceback users have to see."""
 _PLAIN = (int, float, str, list, tuple, Mapping, type(None))  # not networks, tensors, ...
 

@@ -35,7 +35,7 @@ from safe_rl.envs.families import env_names, hint_of_gymnasium
 from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM
-from safe_rl.naming import did_you_mean
+from safe_rl.naming import did_you_mean, nearest
 from safe_rl.runs.identity import differences, flatten
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports
@@ -101,16 +101,17 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
         ValueError: If a transform is chosen twice, or a changed environment has the name of another
             one of the package.
     """
+    choices = hydra.runtime.choices
+    chosen_names = [*choices.items()]
     for word in hydra.overrides.task:
         names = [n.strip() for n in str(word).partition("=[")[2].rstrip("]").split(",")]
-        if word.startswith("transforms=[") and len(set(names)) < len(names):
-            raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
-    choices = hydra.runtime.choices
-    _refuse_hidden_files(choices, hydra.runtime.config_sources)
+        if word.startswith("transforms=["):
+            chosen_names += [("transforms", name) for name in names]
+            if len(set(names)) < len(names):
+                raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
+    _refuse_hidden_files(chosen_names, hydra.runtime.config_sources)
     if "algo" in choices:
         config.algo.name = choices["algo"].rpartition("/")[2]
-    if "name" not in config.env:
-        raise ValueError(f"env={choices.get('env')}: its file needs a line 'name: …'.")
     name, chosen = config.env.name, choices.get("env")
     if chosen is None or name == chosen:
         return
@@ -122,18 +123,18 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
         )
 
 
-def _refuse_hidden_files(choices: Mapping[str, Any], sources: Iterable[Any]) -> None:
-    """Refuse a file of the user's that Hydra does not read, as another one has its name."""
-    folders = [Path(source.path) for source in sources if source.schema == "file"]
-    for group, chosen in choices.items():
-        for name in [chosen] if isinstance(chosen, str) else chosen or ():
-            files = [folder / group.partition("@")[0] / f"{name}.yaml" for folder in folders]
-            found = list(dict.fromkeys(file.resolve() for file in files if file.is_file()))
-            if found[1:]:
-                raise ValueError(
-                    f"{group}={name}: {found[1]} would have no effect, because there is "
-                    f"{found[0]}. Give the file another name."
-                )
+def _refuse_hidden_files(choices: Iterable[tuple[str, Any]], sources: Iterable[Any]) -> None:
+    """Refuse a chosen file of the user's that Hydra does not read: the package's has its name."""
+    folders = [Path(source.path).resolve() for source in sources if source.schema == "file"]
+    for group, name in choices:
+        files = (folder / group.partition("@")[0] / f"{name}.yaml" for folder in folders)
+        found = [file for file in files if file.is_file()]
+        own = [file for file in found if not file.is_relative_to(CONF.resolve())]
+        if own and own[0] != found[0]:
+            raise ValueError(
+                f"{group}={name}: {own[0]} would have no effect, because the package has one of "
+                "this name. Rename your file."
+            )
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -184,6 +185,8 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     foreign = re.search(r"(?s)In '(\S+)': .*Key '\S+' not in '(\S+)'\s+full_key: (\S+)", str(error))
     if foreign:
         return _foreign_key(*foreign.groups())
+    if "Interpolation key 'env.name' not found" in str(error):
+        return "env: the file of an environment needs a line 'name: …'."
     taken = re.match(r"'(\w+)/(\S+)' is validated against ConfigStore schema", str(error))
     if taken:
         return f"{taken[1]}={taken[2]}: the package has one of this name. Rename your file."
@@ -260,14 +263,18 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     if OmegaConf.is_missing(config, section):
         return _absent(section)
     if section == "env" and "kwargs" in config.env:
-        name = key.removeprefix("env.")
-        hint = did_you_mean(name, map(str, config.env), 0.7)
-        return (
-            f"there is no key '{key}'.{hint} Arguments of the environment's constructor are given "
-            f"as env.kwargs='{{{name}: …}}'."
+        name = key.removeprefix("env.").removeprefix("kwargs.")
+        guess = nearest(name, map(str, config.env), 0.7)
+        hint = (
+            f"Did you mean 'env.{guess}'?"
+            if guess
+            else (
+                f"Arguments of the environment's constructor are given as env.kwargs='{{{name}: …}}'."
+            )
         )
-    is_of_own = any(re.match(rf"{section}(\._target_|=.*\b_target_\b)", word) for word in words)
-    if is_of_own and not key.endswith("._target_"):
+        return f"there is no key '{key}'. {hint}"
+    own = rf"\+*{section}(\._target_=|=.*\b_target_: ?)(?!['\"]? ?safe_rl\.)"
+    if any(re.match(own, word) for word in words) and not key.endswith("._target_"):
         return f"there is no key '{key}'. What a class of yours takes is added: '+{key}=…'."
     return unknown_key(key, keys_of(config))
 

@@ -41,9 +41,5 @@ def short_name(name: str) -> str:
     return f"{beginning}-{sha256(name.encode()).hexdigest()[:8]}"
 
 
-# of an environment whose id has a namespace, such as ALE/Pong-v5
-OmegaConf.register_new_resolver(
-    "safe_rl.folder_name", lambda name: name.replace("/", "-"), replace=True
-)
 OmegaConf.register_new_resolver("safe_rl.env_name", env_name, replace=True)
 OmegaConf.register_new_resolver("safe_rl.short_name", short_name, replace=True)

@@ -49,7 +49,7 @@ def check_steps(entries: Mapping[NestedKey, Tensor], cost_keys: Sequence[NestedK
         )
     is_below = min(read[len(sums) :], default=0.0) < 0
     # the sum of all costs last: it is the environment's doing only through one of the others
-    for key in sorted(cost_keys, key="cost".__eq__) if is_below else ():
+    for key in sorted(cost_keys, key=lambda key: key == "cost") if is_below else ():
         if below := int((entries[key] < 0).sum()):
             raise EpisodeError(
                 f"The cost '{key_name(key)}' is below 0 in {below} of {entries[key].numel()} "

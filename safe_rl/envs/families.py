@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from safe_rl.checks import Text
 from safe_rl.envs.foreign import FOREIGN, complete_foreign
@@ -48,6 +49,10 @@ def hint_of_gymnasium(name: str) -> str:
 
 
 _STORED: dict[str, dict[str, Any]] = {}  # the nodes of `store_config` by name
+# of an environment whose id has a namespace, such as ALE/Pong-v5
+OmegaConf.register_new_resolver(
+    "safe_rl.folder_name", lambda name: name.replace("/", "-"), replace=True
+)
 _IN_STORE: dict[str, dict[str, Any]] = {}  # what Hydra's ConfigStore has, by name
 
 

@@ -37,8 +37,8 @@ from safe_rl.scores.certificate import Claim, error_of_next_test, first_certifie
 # number of environments that are stepped together, and of episodes between two checks of a test;
 # MuJoCo Warp takes nearly the same time for a thousand environments as for a hundred
 _BATCH, _BATCH_OF_WARP = 100, 1_000
-# Added to the seed of the run. They differ by about 1e11: no test of a run has the episodes of
-# another run's ranking while seeds differ by less, and a test has fewer than 1e5 batches.
+# Added to the seed of the run. They differ by 1e11: no test of a run has the episodes of another
+# run's ranking while the difference of their seeds plus 1e6 times the number of batches is less.
 _RANKING, _TEST, _AFTER = 100_000_000_003, 200_000_000_041, 300_000_000_077
 _OF_EXPORTED = 50_000_000_021  # of an exported policy, which the tests of its run have chosen
 # of two batches, which have new instances of the environment; of two tests of a run

@@ -1,9 +1,9 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
-Rollouts are [..., T] TensorDicts; time is the last dimension. A trajectory ends where ``("next",
-"done")`` is set, at the last step of the batch, and where the mask of a padded rollout ends or the
-collector's ``traj_ids`` change. Unless it ends with ``("next", "terminated")``, the value of its
-last observation is bootstrapped.
+Rollouts are [..., T] TensorDicts; time is the last dimension, or the one named "time". A trajectory
+ends where ``("next", "done")`` is set, at the last step of the batch, and where the mask of a padded
+rollout ends or the collector's ``traj_ids`` change. Unless it ends with ``("next", "terminated")``,
+the value of its last observation is bootstrapped.
 """
 
 from __future__ import annotations
@@ -125,10 +125,11 @@ class VectorGAE(Checked, ValueEstimatorBase):
         tensordict: TensorDictBase,
         target_params: TensorDictBase | None = None,
         next_value: Tensor | None = None,
+        time_dim: int | None = None,
         **kwargs: Any,
     ) -> Tensor:
         """The value targets alone, [..., T, F]; `next_value` [..., T, F] replaces the network's."""
-        return self._estimate(tensordict, None, next_value, target_params)[-1]
+        return self._estimate(tensordict, None, next_value, target_params, time_dim)[-1]
 
     def _estimate(
         self,
@@ -298,11 +299,11 @@ class JointAdvantages(TensorDictModuleBase):
             ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}
             self.cost.set_keys(**ends)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(self, tensordict: TensorDictBase, *, time_dim: int | None = None) -> TensorDictBase:
         """Write advantages and value targets into a rollout [..., T], and return it."""
-        self.reward(tensordict)
+        self.reward(tensordict, time_dim=time_dim)
         keys = {"advantage": self.reward.tensor_keys.advantage}
         if self.cost is not None:
-            self.cost(tensordict)
+            self.cost(tensordict, time_dim=time_dim)
             keys["cost_advantage"] = self.cost.tensor_keys.advantage
         return normalise_advantages(tensordict, **keys)

@@ -5,6 +5,7 @@ import math
 import custom_loss
 import pytest
 import torch
+from omegaconf import OmegaConf
 from point_mass_runs import point_mass_trainer
 from run_configs import CONF
 from samples import limit_state
@@ -12,6 +13,7 @@ from tensordict import TensorDict
 
 from safe_rl import trust
 from safe_rl.algorithms import Constraints
+from safe_rl.evaluation.settings import certificate_options
 from safe_rl.models import make_actor
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
@@ -58,6 +60,8 @@ def test_it_trains_with_several_costs(tmp_path):
     run, said = Run(tmp_path), []
     certify_finished(run, run.config, 25, stopped_by=None, again="", say=said.append)
     assert said[0].startswith("Not certified: there is no test for limits on UpperSemideviation.")
+    own = OmegaConf.merge(run.config, {"risk": {"tail": 0.2}})
+    assert certificate_options(own).tail == 1.0
 
 
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])

@@ -4,6 +4,7 @@ import pytest
 from commands import composed, status_of
 
 from safe_rl.cli import train
+from safe_rl.files import CONF
 from safe_rl.scores.benchmark import SLATES
 
 RIGHT = [
@@ -147,20 +148,45 @@ def test_a_risk_measure_is_refused_where_no_limit_is_kept():
 
 
 def test_a_file_that_hydra_would_not_read_is_refused(tmp_path):
-    for group, name in (("algo", "p3o"), ("env", "PointGoal1")):
+    for group, name in (("algo", "p3o"), ("env", "PointGoal1"), ("transforms", "saute")):
         (tmp_path / group).mkdir()
         (tmp_path / group / f"{name}.yaml").write_text("loss: {kappa: 777}\n")
-    with pytest.raises(ValueError, match=r"algo=p3o: \S+p3o.yaml would have no effect, because"):
-        composed(f"--config-dir={tmp_path}", "algo=p3o", "env=CarGoal1")
+    for words in (["algo=p3o"], ["transforms=[action_delay,saute]"], ["transforms=saute"]):
+        with pytest.raises(ValueError, match=r"\S+: \S+yaml would have no effect, because"):
+            composed(f"--config-dir={tmp_path}", *words, "env=CarGoal1")
     with pytest.raises(ValueError, match=r"env=PointGoal1: the package has one .* Rename"):
         composed(f"--config-dir={tmp_path}")
 
 
+def test_a_file_of_ones_own_may_come_before_that_of_the_package(tmp_path):
+    (tmp_path / "algo").mkdir()
+    for name in ("config.yaml", "algo/ppo.yaml"):
+        (tmp_path / name).write_text((CONF / name).read_text())
+    words = (f"--config-path={tmp_path}", f"hydra.searchpath=[file://{CONF}]", "algo=ppo")
+    assert status_of(*words, "--cfg", "job") in (0, None)
+    assert "frames=-1" in status_of(*words, "frames=-1")
+
+
+def test_a_file_of_an_environment_without_its_name(tmp_path):
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "nameless.yaml").write_text("_target_: mine.make\n")
+    said = status_of(f"--config-dir={tmp_path}", "env=nameless")
+    assert said == "env: the file of an environment needs a line 'name: …'."
+
+
 def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():
-    with pytest.raises(ValueError, match=r"no key 'env.mode'\. Arg.* env\.kwargs='\{mode: …\}'\.$"):
-        composed("env=gymnasium", "env.id=CartPole-v1", "env.mode=x")
+    env = ("env=gymnasium", "env.id=CartPole-v1")
+    for word, message in (
+        ("env.mode=x", r"no key 'env.mode'\. Arg.* env\.kwargs='\{mode: …\}'\.$"),
+        ("env.kwargs.mode=x", r"no key 'env.kwargs.mode'\. Arg.* env\.kwargs='\{mode: …\}'\.$"),
+        ("env.kwarg={mode: x}", r"no key 'env.kwarg'\. Did you mean 'env.kwargs'\?$"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            composed(*env, word)
     with pytest.raises(ValueError, match=r"'loss.size'\. What a .* is added: '\+loss.size=…'\.$"):
         composed("loss._target_=mine.Loss", "loss.size=3")
+    with pytest.raises(ValueError, match=r"Did you mean 'loss\.clip_epsilon'"):
+        composed("loss._target_=safe_rl.objectives.PPOLoss", "loss.clip_epsilonn=3")
 
 
 def test_an_id_with_a_namespace_names_one_folder():

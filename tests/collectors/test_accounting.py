@@ -162,6 +162,9 @@ def test_costs_below_0_are_refused_with_their_name():
     steps["next", "cost_own"] = steps["next", "cost"]
     with pytest.raises(EpisodeError, match="'cost_own' is below 0"):  # of which it is the sum
         EpisodeAccounting(1, ["cost", "cost_own"]).update(steps)
+    steps["next", "of", "cost"] = steps["next"].pop("cost_own")
+    with pytest.raises(EpisodeError, match="'of/cost' is below 0"):
+        EpisodeAccounting(1, ["cost", ("of", "cost")]).update(steps)
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])

@@ -210,5 +210,3 @@ def test_torchrls_wrapper_makes_them_by_their_ids():
     """It asks for a frameskip first, and goes on without one if Python says so."""
     env = GymEnv("Safexp-PointGoal1-v0", config=SHORT)
     assert env.rollout(5).shape == (3,)
-    with pytest.raises(TypeError, match=r"unexpected .* 'num_steps'\. Keys .* config=\{'num_steps"):
-        gymnasium.make("Safexp-PointGoal1-v0", num_steps=3)

@@ -175,7 +175,10 @@ def test_time_is_the_dimension_of_that_name(named):
     words = {} if named else {"time_dim": 0}
     rollout = VectorGAE(critic, **settings)(rollout.clone())
     theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(turned.clone(), **words)
-    found = VectorGAE(critic, **settings)(turned, **words)
+    estimator = VectorGAE(critic, **settings)
+    targets = estimator.value_estimate(turned, **words)
+    found = estimator(turned, **words)
+    torch.testing.assert_close(found["value_target"], targets)
     for key in ("advantage", "value_target", "state_value"):
         torch.testing.assert_close(found[key], rollout[key].transpose(0, 1))
     torch.testing.assert_close(found["advantage"], theirs["advantage"], atol=1e-5, rtol=1e-5)

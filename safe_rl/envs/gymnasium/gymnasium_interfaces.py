@@ -17,7 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Composite, TensorSpec
 
 from safe_rl.envs.families import env_node, make_env
-from safe_rl.envs.keys import COST
+from safe_rl.envs.keys import COST, ConfigError
 from safe_rl.envs.simulated import SimulatedEnv
 
 EPISODE_COST = "episode_cost"  # sum over the steps of the episode so far
@@ -55,11 +55,10 @@ class Worlds:
         height: int = 360,
         **unknown: Any,
     ) -> None:
-        for key in unknown:  # in Python's words: TorchRL tries frameskip=, and goes on without it
-            raise TypeError(
-                f"{type(self).__name__} got an unexpected keyword argument '{key}'. Keys of the "
-                f"environment are given as config={{'{key}': …}}."
-            )
+        if "frameskip" in unknown:  # TorchRL tries it, and goes on without it for these words
+            raise TypeError(f"{type(self).__name__} got an unexpected keyword argument 'frameskip'")
+        for key in unknown:
+            raise ConfigError(f"Unknown argument '{key}': keys are given as config={{'{key}': …}}.")
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(f"render_mode must be one of {RENDER_MODES}, got {render_mode!r}.")
         node = {**({} if name is None else env_node(name)), **(config or {})}
