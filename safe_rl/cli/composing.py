@@ -28,10 +28,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from safe_rl.cli.config import General, keys_of, unknown_key
-from safe_rl.cli.folders import env_name
+from safe_rl.cli.folders import name_choices
 from safe_rl.cli.options import first_line, unreadable
 from safe_rl.envs import store_configs
-from safe_rl.envs.families import env_names, hint_of_gymnasium
+from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM
@@ -92,49 +92,6 @@ def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
             return compose(name, list(words), return_hydra_config=True)
     finally:
         GlobalHydra.instance().hydra = outside
-
-
-def name_choices(config: DictConfig, hydra: Any) -> None:
-    """Give a run the names of what was chosen: whatever was merged into it, the name is true.
-
-    Raises:
-        ValueError: If a transform is chosen twice, or a changed environment has the name of another
-            one of the package.
-    """
-    choices = hydra.runtime.choices
-    chosen_names = [*choices.items()]
-    for word in hydra.overrides.task:
-        names = [n.strip() for n in str(word).partition("=[")[2].rstrip("]").split(",")]
-        if word.startswith("transforms=["):
-            chosen_names += [("transforms", name) for name in names]
-            if len(set(names)) < len(names):
-                raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
-    _refuse_hidden_files(chosen_names, hydra.runtime.config_sources)
-    if "algo" in choices:
-        config.algo.name = choices["algo"].rpartition("/")[2]
-    name, chosen = config.env.name, choices.get("env")
-    if chosen is None or name == chosen:
-        return
-    config.env.name = env_name(name, chosen, hydra.runtime.config_sources)
-    if config.env.name == name and name in env_names():
-        raise ValueError(
-            f"env.name={name} would train env={chosen} under the name of another environment. To "
-            f"choose that one, write env={name}."
-        )
-
-
-def _refuse_hidden_files(choices: Iterable[tuple[str, Any]], sources: Iterable[Any]) -> None:
-    """Refuse a chosen file of the user's that Hydra does not read: the package's has its name."""
-    folders = [Path(source.path).resolve() for source in sources if source.schema == "file"]
-    for group, name in choices:
-        files = (folder / group.partition("@")[0] / f"{name}.yaml" for folder in folders)
-        found = [file for file in files if file.is_file()]
-        own = [file for file in found if not file.is_relative_to(CONF.resolve())]
-        if own and own[0] != found[0]:
-            raise ValueError(
-                f"{group}={name}: {own[0]} would have no effect, because the package has one of "
-                "this name. Rename your file."
-            )
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -264,15 +221,12 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
         return _absent(section)
     if section == "env" and "kwargs" in config.env:
         name = key.removeprefix("env.").removeprefix("kwargs.")
-        guess = nearest(name, map(str, config.env), 0.7)
-        hint = (
-            f"Did you mean 'env.{guess}'?"
-            if guess
-            else (
-                f"Arguments of the environment's constructor are given as env.kwargs='{{{name}: …}}'."
-            )
+        if guess := nearest(name, map(str, config.env), 0.7):
+            return f"there is no key '{key}'. Did you mean 'env.{guess}'?"
+        return (
+            f"there is no key '{key}'. Arguments of the environment's constructor are given as "
+            f"env.kwargs='{{{name}: …}}'."
         )
-        return f"there is no key '{key}'. {hint}"
     own = rf"\+*{section}(\._target_=|=.*\b_target_: ?)(?!['\"]? ?safe_rl\.)"
     if any(re.match(own, word) for word in words) and not key.endswith("._target_"):
         return f"there is no key '{key}'. What a class of yours takes is added: '+{key}=…'."

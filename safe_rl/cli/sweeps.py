@@ -21,8 +21,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from safe_rl.cli.composing import name_choices
 from safe_rl.cli.config import check_settings
+from safe_rl.cli.folders import name_choices
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import differences, is_to_keep_limits

@@ -27,12 +27,12 @@ from safe_rl.cli.composing import (
     COMPOSITION_ERRORS,
     RESUMED,
     explain,
-    name_choices,
     overrides_of,
     read_resumed,
     refuse_changes,
 )
 from safe_rl.cli.config import check_settings
+from safe_rl.cli.folders import name_choices
 from safe_rl.cli.options import end_by_interrupt, keep_streams, split_imports, take_word
 from safe_rl.cli.sweeps import run_in_sweep
 from safe_rl.envs import store_configs

@@ -79,9 +79,7 @@ class Certificate:
     def _bound_text(self, name: str) -> str:
         bound, limit = self.verdict.bounds[name]
         if math.isinf(bound):
-            return (
-                f"{name} has no bound: costs are NaN, or above those that the specs allow"
-            )
+            return f"{name} has no bound: costs are NaN, or above those that the specs allow"
         why = " by construction" if name in self.verdict.by_construction else ""
         return f"{name} ≤ {rounded_up(bound):.3g}{why}, limit {limit:g}"
 

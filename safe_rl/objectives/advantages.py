@@ -1,9 +1,9 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
 Rollouts are [..., T] TensorDicts; time is the last dimension, or the one named "time". A trajectory
-ends where ``("next", "done")`` is set, at the last step of the batch, and where the mask of a padded
-rollout ends or the collector's ``traj_ids`` change. Unless it ends with ``("next", "terminated")``,
-the value of its last observation is bootstrapped.
+ends where ``("next", "done")`` is set, at the last step of the batch, and where the mask of a
+padded rollout ends or ``traj_ids`` change. Unless it ends with ``("next", "terminated")``, the
+value of its last observation is bootstrapped.
 """
 
 from __future__ import annotations
