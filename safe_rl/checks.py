@@ -211,7 +211,7 @@ def checked(function: Function) -> Function:
             value = given.get(name, ...)
             # a list of a configuration, as Hydra passes it, is no list for pydantic
             plain = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-            # only a plain setting that has a name is passed on as converted, such as 3e5 as 300000
+            # 3e5 is passed on as 300000, but a list of a configuration as it is
             if isinstance(plain, _PLAIN):
                 checked_value = check_value(name, check, plain)
                 kwargs |= {name: checked_value} if name in kwargs and plain is value else {}

@@ -220,9 +220,9 @@ def check_cost_limits(
         if key not in cost_keys:
             raise ValueError(
                 f"cost_limits names '{key}', but this environment has no such cost."
-                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}. Safety Gym's "
-                "environments get others by env.constrain_<kind>=true; those that a first step of "
-                "Gymnasium's does not report are named by env.cost_keys=[…]."
+                f"{did_you_mean(key, cost_keys, 0.7)} It has {', '.join(cost_keys)}. In Safety "
+                "Gym's environments env.constrain_<kind>=true adds others; with env=gymnasium, "
+                "env.cost_keys=[…] names costs that the first step does not report."
             )
         limits[key] = float(limit)
     return limits

@@ -48,7 +48,7 @@ def check_steps(entries: Mapping[NestedKey, Tensor], cost_keys: Sequence[NestedK
             "first NaN or infinite number."
         )
     is_below = min(read[len(sums) :], default=0.0) < 0
-    # the sum of all costs last: it is the environment's doing only through one of the others
+    # `cost` last: where it is the sum of the others, one of them is the cause
     for key in sorted(cost_keys, key=lambda key: key == "cost") if is_below else ():
         if below := int((entries[key] < 0).sum()):
             raise EpisodeError(

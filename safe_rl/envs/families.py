@@ -49,11 +49,11 @@ def hint_of_gymnasium(name: str) -> str:
 
 
 _STORED: dict[str, dict[str, Any]] = {}  # the nodes of `store_config` by name
-# of an environment whose id has a namespace, such as ALE/Pong-v5
+_IN_STORE: dict[str, dict[str, Any]] = {}  # what Hydra's ConfigStore has, by name
+# an id may have a namespace, such as ALE/Pong-v5; its name is that of a folder
 OmegaConf.register_new_resolver(
     "safe_rl.folder_name", lambda name: name.replace("/", "-"), replace=True
 )
-_IN_STORE: dict[str, dict[str, Any]] = {}  # what Hydra's ConfigStore has, by name
 
 
 def env_names() -> list[str]:

@@ -73,7 +73,7 @@ class Certificate:
 
     @property
     def has_bounds(self) -> bool:
-        """Whether the costs were those that the environment's specs allow."""
+        """Whether every mean has a bound; without one, more training cannot help."""
         return all(math.isfinite(bound) for bound, _ in self.verdict.bounds.values())
 
     def _bound_text(self, name: str) -> str:

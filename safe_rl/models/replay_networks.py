@@ -118,7 +118,7 @@ class SquashedNormal(TanhNormal):
 
     def __getattr__(self, name: str) -> Any:
         given = self.__dict__.get("_given")
-        # with "_t", TorchRL's constructor is running or done: what is missing is really missing
+        # with "_t", TorchRL's constructor is running or done: there is no such attribute
         if given is None or "_t" in self.__dict__ or name.startswith("__"):
             raise AttributeError(f"'{type(self).__name__}' has no attribute '{name}'")
         super().__init__(**given)

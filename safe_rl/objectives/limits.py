@@ -304,7 +304,7 @@ class LimitTracker(Checked, Resumable):
             return estimate.mean + scale
         margin = torch.minimum(self.margin * self._noise, self.largest_margin * self.limits)
         left = self.free_steps + self.descent_steps - self._steps + num_steps
-        # of what is left, so that the goal is reached by `descent_steps`, whatever the batch size
+        # of what is left: so the descent ends after its steps, whatever the size of a batch
         share = num_steps / left if left > num_steps else 1.0
         # if the cost is already below the falling limit, the limit continues from the cost
         reached, goal = torch.minimum(self._reached, estimate.mean), self.limits - margin

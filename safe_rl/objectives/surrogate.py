@@ -8,11 +8,7 @@ from typing import Any
 import torch
 from pydantic import NonNegativeFloat
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import (
-    CompositeDistribution,
-    ProbabilisticTensorDictSequential,
-    dispatch,
-)
+from tensordict.nn import CompositeDistribution, ProbabilisticTensorDictSequential, dispatch
 from torch import Tensor
 from torch.distributions import Distribution
 

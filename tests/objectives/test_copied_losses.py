@@ -1,4 +1,4 @@
-"""Losses that are copied or moved: their networks are still those that they train."""
+"""Losses that are copied, moved, restored or given other parameters: which ones they use."""
 
 import copy
 import pickle
@@ -6,6 +6,9 @@ from itertools import chain
 
 import pytest
 import torch
+from q_losses import lagrange, make_steps, told
+from q_losses import make_loss as make_q_loss
+from tensordict import TensorDict
 
 from safe_rl.models import make_actor, make_bounded_actor, make_critic
 from safe_rl.objectives import BCLoss, CriticLoss, PPOLoss
@@ -35,3 +38,52 @@ def test_networks_share_the_tensors_of_their_loss(change, kind):
     for network in (getattr(loss, name) for name in names):
         for tensor in chain(network.parameters(), network.buffers()):
             assert tensor.data_ptr() in own
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+@pytest.mark.parametrize(
+    "change",
+    [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss)), lambda x: x.double().float()],
+    ids=["copied", "stored", "moved"],
+)
+def test_a_loss_learns_from_its_own_networks_after_it_was(change, kind):
+    loss, fresh, steps = *(make_q_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
+    loss(steps.clone())
+    (changed := change(loss)).load_state_dict(fresh.state_dict())
+    found = []
+    for module in (changed, fresh):
+        torch.manual_seed(1)
+        found.append(module(steps.clone()).to_dict())
+    torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_parameters_in_place_of_its_own_are_used_and_no_longer_than_they_are_there(kind):
+    loss, fresh, steps = *(make_q_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
+
+    def found(module):
+        torch.manual_seed(1)
+        return module(steps.clone())["loss_qvalue"].detach()
+
+    before, expected = found(loss), found(fresh)
+    for warm in (True, False):  # whether the loss has been called with its own ones
+        loss = loss if warm else copy.deepcopy(loss)
+        with TensorDict.from_module(fresh).data.to_module(loss):
+            torch.testing.assert_close(found(loss), expected)
+        torch.testing.assert_close(found(loss), before)
+    assert (before - expected).abs() > 1e-4
+    loss(steps.clone())["loss_qvalue"].backward()
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
+def test_a_new_loss_with_the_state_of_another_one_needs_no_batch(kind):
+    known = told(make_q_loss(kind, lagrange(1.0, 1.0)), [2.0, 3.0], rewards=[1.0, 2.0])
+    fresh = make_q_loss(kind, lagrange(1.0, 1.0), is_prepared=False)
+    with pytest.raises(ValueError, match="does not know the scales"):
+        fresh(make_steps())
+    fresh.load_state_dict(known.state_dict())
+    steps, found = make_steps(), []
+    for loss in (known, fresh):
+        torch.manual_seed(1)
+        found.append(loss(steps.clone()).to_dict())
+    torch.testing.assert_close(*found)

@@ -1,12 +1,9 @@
 """Losses on Q functions against TorchRL's own, against formulas written out, and finite limits."""
 
-import copy
-import pickle
-
 import pytest
 import torch
+from q_losses import BOUNDS, COSTS, SAC, SPEC, TD3, lagrange, make_loss, make_q, make_steps, told
 from samples import limit_state
-from tensordict import TensorDict
 from torch import nn
 from torchrl import objectives
 from torchrl.data import Bounded
@@ -14,65 +11,11 @@ from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
+from safe_rl.models import make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import (
-    CALLoss,
-    LagrangeMultiplier,
     SACLagrangianLoss,
-    SACLoss,
-    TD3LagrangianLoss,
     TD3Loss,
 )
-
-BOUNDS = -torch.ones(2), torch.ones(2)
-SPEC = Bounded(-1, 1, [2])
-COSTS = ["cost", "cost_other"]
-SAC = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": SPEC}
-CAL = SAC | {"convexity": 10.0, "ratio_memory": 0.9, "largest_ratio": 2.0}
-TD3 = {"gamma": 0.9, "policy_noise": 0.2, "noise_clip": 0.5, "action_spec": SPEC}
-
-
-def make_steps(size=6, terminated=False):
-    flags = torch.full((size, 1), terminated)
-    following = {
-        "observation": torch.randn(size, 3), "reward": torch.randn(size, 1),
-        "done": flags, "terminated": flags,
-        **{key: torch.rand(size, 1) for key in COSTS},
-    }  # fmt: skip
-    return TensorDict(
-        observation=torch.randn(size, 3), action=torch.rand(size, 2), next=following,
-        batch_size=[size],
-    )  # fmt: skip
-
-
-def make_q(networks=2, **keys):
-    return QEnsemble(3, 2, hidden_sizes=[8], num_networks=networks, **keys)
-
-
-def told(loss, unit, rewards=()):
-    """The loss, which knows the size of one cost, and these rewards."""
-    rewards = torch.as_tensor(rewards).reshape(-1, 1)
-    batch = TensorDict({"next": {"reward": rewards}}, rewards.shape[:1])
-    loss.prepare(batch, limit_state(*[0.0] * len(unit), unit=unit))
-    return loss
-
-
-def make_loss(kind, multiplier=None, networks=2, **keys):
-    make_own, settings, plain, constrained = {
-        "sac": (make_squashed_actor, SAC, SACLoss, SACLagrangianLoss),
-        "td3": (make_bounded_actor, TD3, TD3Loss, TD3LagrangianLoss),
-        "cal": (make_squashed_actor, CAL, SACLoss, CALLoss),
-    }[kind]
-    settings, actor = settings | keys, make_own(3, *BOUNDS, hidden_sizes=[8])
-    if multiplier is None:
-        return plain(actor, make_q(), **settings)
-    cost_q = make_q(networks, num_outputs=2, out_key="cost_value")
-    loss = constrained(actor, make_q(), cost_q, multiplier=multiplier, cost_keys=COSTS, **settings)
-    return told(loss, [1.0, 1.0])
-
-
-def lagrange(*values):
-    return LagrangeMultiplier(dict(zip(COSTS, (25.0, 10.0), strict=True)), init=values, lr=0.05)
 
 
 def as_stock(loss, kind):
@@ -302,23 +245,6 @@ def test_the_value_estimator_that_one_asks_for_is_used(kind, given):
     torch.testing.assert_close(losses["loss_cost_qvalue"], costs)
 
 
-@pytest.mark.parametrize("kind", ["sac", "td3"])
-@pytest.mark.parametrize(
-    "change",
-    [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss)), lambda x: x.double().float()],
-    ids=["copied", "stored", "moved"],
-)
-def test_a_loss_learns_from_its_own_networks_after_it_was(change, kind):
-    loss, fresh, steps = *(make_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
-    loss(steps.clone())
-    (changed := change(loss)).load_state_dict(fresh.state_dict())
-    found = []
-    for module in (changed, fresh):
-        torch.manual_seed(1)
-        found.append(module(steps.clone()).to_dict())
-    torch.testing.assert_close(*found)
-
-
 @pytest.mark.parametrize("kind", ["td3", "sac"])
 @pytest.mark.parametrize("multiplier", [None, (1.0, 1.0)])
 def test_losses_may_be_asked_for_one_entry(kind, multiplier):
@@ -365,40 +291,6 @@ def test_the_bias_of_critics_of_costs_that_never_end(kind):
     # half a cost per step is worth 5 at a discount of 0.9; the critics say 6 and 2
     found = loss.cost_bias(steps.reshape(2, 50))
     torch.testing.assert_close(found, torch.tensor([1.0, -3.0]))
-
-
-@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
-def test_parameters_in_place_of_its_own_are_used_and_no_longer_than_they_are_there(kind):
-    loss, fresh, steps = (
-        *(make_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)),
-        make_steps(),
-    )
-
-    def found(module):
-        torch.manual_seed(1)
-        return module(steps.clone())["loss_qvalue"].detach()
-
-    before, expected = found(loss), found(fresh)
-    for warm in (True, False):  # whether the loss has been called with its own ones
-        loss = loss if warm else copy.deepcopy(loss)
-        with TensorDict.from_module(fresh).data.to_module(loss):
-            torch.testing.assert_close(found(loss), expected)
-        torch.testing.assert_close(found(loss), before)
-    assert (before - expected).abs() > 1e-4
-    loss(steps.clone())["loss_qvalue"].backward()
-
-
-@pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
-def test_a_new_loss_with_the_state_of_another_one_needs_no_batch(kind):
-    make_own, kinds = make_loss(kind, lagrange(1.0, 1.0)), make_loss(kind, lagrange(1.0, 1.0))
-    told(make_own, [2.0, 3.0], rewards=[1.0, 2.0])
-    kinds._is_prepared = False
-    kinds.load_state_dict(make_own.state_dict())
-    steps, found = make_steps(), []
-    for loss in (make_own, kinds):
-        torch.manual_seed(1)
-        found.append(loss(steps.clone()).to_dict())
-    torch.testing.assert_close(*found)
 
 
 def test_steps_without_a_batch_dimension():
