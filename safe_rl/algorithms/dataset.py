@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from re import search
 from typing import Any
 
 import torch
@@ -27,6 +27,7 @@ from safe_rl.collectors import (
 from safe_rl.files import read_config
 from safe_rl.models.replay_networks import bounded_actions
 
+_OF_SAFETY_GYMNASIUM = re.compile(r"(?:Safety|Offline)(\w+)Gymnasium-v\d")  # names of files
 _ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
 
 
@@ -76,7 +77,11 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
 
 
 def _other_environment(config: DictConfig) -> str:
-    """A warning if the recording is of a run in another environment; else an empty text."""
+    """A warning if the dataset is of another environment; else an empty text."""
+    if file := _OF_SAFETY_GYMNASIUM.search(Path(config.dataset.path).name):
+        named = config.env.name.removeprefix("Safety").removeprefix("Safe").partition("-")[0]
+        other = f" Warning: they are of {file[0]}, and this environment is {config.env.name}."
+        return "" if named == file[1] else other
     here: Any = OmegaConf.to_container(config, resolve=True)
     try:
         there = read_config(Path(config.dataset.path).parent / "config.yaml")
@@ -174,8 +179,8 @@ def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> None:
             f"it has {lengths.max():,} steps without an end, and episodes of this environment have "
             f"at most {longest:,}: mark every end in terminals or timeouts."
         )
-    terminated = lengths[steps["next", "terminated"].flatten()[ends]] == longest
-    if terminated.sum() > 1 and (terminated.all() or not steps["next", "truncated"].any()):
+    terminated = steps["next", "terminated"].flatten()[ends][lengths == longest]
+    if len(terminated) > 1 and terminated.all():
         raise ValueError(
             f"its episodes of {longest} steps terminate, so these are time-outs, after which "
             "values are bootstrapped: mark them in timeouts only."
@@ -198,7 +203,7 @@ def _order_columns(
                 steps[key] = steps[key][..., order]
     if named is not None:
         return ""
-    match = search(r"(?:Safety|Offline)\w+Gymnasium-v\d", Path(node.path).name)
+    match = _OF_SAFETY_GYMNASIUM.search(Path(node.path).name)
     if match and columns is None:
         raise ValueError(
             f"it is of {match[0]}, whose columns have another order: dataset.columns="

@@ -146,10 +146,6 @@ def read_hdf5(path: Path | str) -> TensorDict:
         nodes = _nodes(path, file)
         episodes = (name for name in nodes if fullmatch(r"episode_\d{1,18}", name))
         names = sorted(episodes, key=lambda name: int(name[8:]))
-        if names and (total := file.attrs.get("total_episodes", len(names))) != len(names):
-            raise ValueError(
-                f"{path} says that it has {total} episodes, and {len(names)} are there."
-            )
         arrays = _read_episodes(path, nodes, names) if names else _read_flat(path, nodes)
     number = len(arrays["action"])
     if not number:
@@ -210,14 +206,15 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
     arrays = _check_shapes(path, _arrays(path, nodes, _FLAT))
     here = arrays["observation"]
     ends = (arrays["next", "terminated"] | arrays["next", "truncated"]).reshape(-1)
+    ends[-1:] = True
     is_given = "next_observations" in nodes
     following = _values(path, nodes["next_observations"]) if is_given else np.roll(here, -1, 0)
     arrays = _check_shapes(path, {**arrays, ("next", "observation"): following})
     if np.array_equal(following, here) and (here != here[:1]).any():
         raise ValueError(f"{path}: its next_observations are equal to its observations.")
-    is_close = np.isclose(following[:-1], here[1:], 1e-4, 1e-6, equal_nan=True)
+    is_close = np.isclose(following, np.roll(here, -1, 0), 1e-4, 1e-6, equal_nan=True)
     is_next = is_close.all(tuple(range(1, here.ndim)))
-    gaps = ~is_next & ~ends[:-1]
+    gaps = ~is_next & ~ends
     if gaps.any():
         raise ValueError(
             f"{path}: another observation follows its step {gaps.argmax()} than next_observations "
@@ -226,7 +223,7 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
         )
     # at an end, an array made by a shift has the next episode's first observation, from which
     # losses would take the value of what follows a truncated step
-    is_of_next = np.append(ends[:-1] & is_next, not is_given).reshape(-1, *[1] * (here.ndim - 1))
+    is_of_next = (ends & is_next).reshape(-1, *[1] * (here.ndim - 1))
     return {**arrays, ("next", "observation"): np.where(is_of_next, here, following)}
 
 

@@ -111,15 +111,16 @@ def is_cost(name: Any) -> bool:
     return name == COST or str(name).startswith(f"{COST}_")
 
 
+_TOTALS = ("total", "return", "cumulative", "episode")
 #: These names usually mean something else than the cost of a step. `cost_keys` can still name them.
-_NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", "total", "return")}
+_NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", *_TOTALS)}
 
 
 def found_costs(names: Iterable[Any]) -> list[str]:
     """Names of the costs of a step among those that an environment writes.
 
     Examples:
-        >>> found_costs(["place", "cost", "cost_doors", "cost_limit"])
+        >>> found_costs(["place", "cost", "cost_doors", "cost_limit", "cost_cumulative"])
         ['cost', 'cost_doors']
     """
     return [str(name) for name in names if is_cost(name) and name not in _NOT_OF_STEPS]

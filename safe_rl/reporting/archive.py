@@ -174,7 +174,7 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
 
     settings = read_config(folder.config_file)
     if not folder.table_file.exists():
-        raise ValueError("it has not begun: no progress.csv")
+        raise ValueError("no progress.csv: it is no run of safe_rl, or has not begun")
     table = read_table(folder.table_file)
     with _noted(folder.table_file, skipped):
         if not read_bounded(folder.table_file, _MOST_BYTES).endswith(b"\n"):

@@ -123,7 +123,10 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
         ValueError: If one of the algorithms has no run.
     """
     runs, skipped = find_runs(root, unfinished=options.unfinished)
-    runs = [*runs, *_baselines(listed(options.baselines), {run.environment for run in runs})]
+    own = {run.environment for run in runs}
+    for place in (Path(place).expanduser() for place in listed(options.baselines)):
+        added, missed = _baselines(place, own)
+        runs, skipped = [*runs, *added], skipped | missed
     algorithms, width = listed(options.algos), options.width
     known = sorted({run.algorithm for run in runs})
     for name in algorithms:
@@ -155,15 +158,15 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     return Report(experiments, sections, skipped)
 
 
-def _baselines(places: Sequence[str], environments: Collection[str]) -> list[Run]:
-    """Finished runs of other folders in some environments, with the names of their folders."""
-    runs = []
-    for place in (Path(place).expanduser() for place in places):
-        for run in find_runs(place)[0]:
-            if run.environment in environments and run.is_finished:
-                run.source = clean(place.resolve().name, 40)
-                runs.append(run)
-    return runs
+def _baselines(place: Path, environments: Collection[str]) -> tuple[list[Run], dict[Path, str]]:
+    """Finished runs of another folder in some environments, with its name; and what is left out."""
+    found, skipped = find_runs(place)
+    runs = [run for run in found if run.environment in environments and run.is_finished]
+    for run in runs:
+        run.source = clean(place.resolve().name, 40)
+    if not runs:
+        skipped[place] = "no baselines: it has no finished run on an environment of these runs"
+    return runs, skipped
 
 
 def _by_environment(experiments: Sequence[Experiment]) -> list[list[Experiment]]:

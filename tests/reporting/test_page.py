@@ -198,7 +198,7 @@ def test_the_page_holds_everything_itself(report):
     # what people wrote is text, not markup
     assert "A &lt;title&gt;" in html
     assert "python train.py env=Mine &#39;+note=&lt;b&gt;&amp;&#39;" in html
-    assert "it has not begun" in html
+    assert "it is no run of safe_rl, or has not begun" in html
 
 
 def test_slates_that_all_share_are_averaged(tmp_path):
@@ -260,6 +260,14 @@ def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_ar
     table = pandas.read_csv(out / "final_PointGoal1.csv").set_index("algorithm").episode_return
     assert table.to_dict() == {"PPO": 1.0, "Mine, first": 1.0, "Mine, first (held_out)": 5.0}
     assert not (out / "final_CarGoal1.csv").exists()
+    for run in other.glob("*/cpo/*/progress.csv"):
+        run.unlink()
+    others = tmp_path / "others"
+    write_run(others, env="CarGoal1", algo="ppo")
+    assert main([str(mine), f"out={out}", f"baselines={other},{others}"]) == 0
+    told = dict(pandas.read_csv(out / "left_out.csv").to_numpy().tolist())
+    assert any("seed0" in place and "no progress.csv" in why for place, why in told.items())
+    assert told[str(others)].startswith("no baselines: it has no finished run")
     assert list(read_archive(kept)) == ["PointGoal1/cpo/seed0"]
     assert main([str(mine), *words[:2], "algos=ppo"]) == 0  # only the baselines have it
     assert list(pandas.read_csv(out / "final_PointGoal1.csv").algorithm) == ["PPO"]

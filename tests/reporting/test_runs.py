@@ -87,7 +87,7 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
         reasons["f1"]
         == "config.yaml is not that of a run: it lacks a usable env, algo, seed, frames"
     )
-    assert reasons["f2"] == "it has not begun: no progress.csv"
+    assert reasons["f2"] == "no progress.csv: it is no run of safe_rl, or has not begun"
     assert reasons["f3"] == "it has not finished an epoch"
     assert "progress.csv, line 3 has 1 fields" in reasons["f4"]
     assert reasons["f5"].startswith("config.yaml cannot be read")
@@ -97,7 +97,7 @@ def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
     with pytest.raises(FileNotFoundError, match="a run is a folder with config"):
         find_runs(tmp_path)
     (write_run(tmp_path) / "progress.csv").unlink()
-    with pytest.raises(FileNotFoundError, match="seed0: it has not begun"):
+    with pytest.raises(FileNotFoundError, match=r"seed0: no progress\.csv: it is no run"):
         find_runs(tmp_path)
     with pytest.raises(FileNotFoundError, match="There is no folder"):
         find_runs(tmp_path / "elsewhere")

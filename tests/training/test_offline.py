@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Composite, Unbounded
 
 from safe_rl.algorithms import OffPolicy
+from safe_rl.algorithms.dataset import _other_environment
 from safe_rl.collectors import Recording, make_collector, read_recording, safe_episodes
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.models import make_bounded_actor, make_squashed_actor
@@ -84,6 +85,14 @@ def test_what_is_cloned_are_the_safe_episodes(tmp_path):
     assert table["policy_loss_actor"][-1] < 0.01 < table["policy_loss_actor"][0]
     assert table["policy_num_updates"] == [160] * 8
     assert len(trainer.algorithm.replay_buffer) == 160  # nothing of what it did itself
+
+
+def test_files_of_another_task_are_named(tmp_path):
+    task = OmegaConf.create({"dataset": {"path": "SafetyPointGoal2Gymnasium-v0-200-3442.hdf5"}})
+    for name in ("PointGoal2", "SafetyPointGoal2-v0"):
+        assert _other_environment(OmegaConf.merge(task, {"env": {"name": name}})) == ""
+    told = _other_environment(OmegaConf.merge(task, {"env": {"name": "PointGoal1"}}))
+    assert "of SafetyPointGoal2Gymnasium-v0, and this environment is PointGoal1." in told
 
 
 def test_keys_and_transforms_that_differ_are_named(tmp_path):
