@@ -214,7 +214,8 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
         config = _compose([*_searched(folders), *others], name)
     except (HydraException, OmegaConfBaseException):
         is_sweep = {"-m", "--multirun"} & {*words}
-        hint = f" If only swept algorithms have it, write '++{key}=…'." if is_sweep else ""
+        of_algorithm = is_sweep and not key.startswith("transforms.")
+        hint = f" If only swept algorithms have it, write '++{key}=…'." if of_algorithm else ""
         return unknown_key(key, []) + hint
     section = key.partition(".")[0]
     if OmegaConf.is_missing(config, section):

@@ -201,6 +201,9 @@ def check_settings(config: DictConfig) -> None:
     become integers.
     """
     try:
+        for needed in ("frames", "num_envs", "frames_per_batch"):
+            if OmegaConf.is_missing(config, needed):
+                raise SettingError(f"{needed} is missing: the file of an algorithm sets it.")
         with open_dict(config):
             for name in [key for key in config if OmegaConf.is_missing(config, key)]:
                 del config[name]

@@ -30,13 +30,14 @@ def env_name(name: str, chosen: str, sources: Iterable[Any] = ()) -> str:
 
 
 def short_name(name: str) -> str:
-    """A name that file systems can hold: of one over 255 bytes its beginning and a hash.
+    """The name of one folder: without slashes, and of one over 255 bytes its beginning and a hash.
 
     Examples:
-        >>> short_name("frames=3"), short_name("a" * 300) == "a" * 200 + "-9835fa6b"
-        ('frames=3', True)
+        >>> short_name("init_from=../a"), short_name("a" * 300) == "a" * 200 + "-9835fa6b"
+        ('init_from=.._a', True)
     """
-    if all(len(part.encode()) <= 255 for part in name.split("/")):
+    name = name.replace("/", "_")
+    if len(name.encode()) <= 255:
         return name
     beginning = name.encode()[:200].decode(errors="ignore")
     return f"{beginning}-{sha256(name.encode()).hexdigest()[:8]}"

@@ -95,6 +95,8 @@ def train(
         )
     if "resume" in settings:
         raise ValueError("safe_rl.resume(directory) continues a run.")
+    if "import" in settings:
+        raise ValueError("import: in Python imports=… names the modules.")
     if directory == "":
         raise ValueError("directory=… names the folder of the run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()

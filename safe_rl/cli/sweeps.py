@@ -119,11 +119,12 @@ class Summary(Callback):
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
         """Note that a job has begun; another line follows unless it is interrupted."""
         if config.hydra.mode == RunMode.MULTIRUN:
-            if os.getppid() == self._process:
+            # not by the parent's id: the sweep may have been killed before this
+            if os.getpid() != self._process and "n_jobs" in config.hydra.launcher:
                 from safe_rl.collectors.workers import end_with_parent  # with torch
 
                 # otherwise the job would go on, or wait for ever, after the sweep was killed
-                end_with_parent(_GRACE)
+                end_with_parent(_GRACE, self._process)
             self._note(config, "interrupted")
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:

@@ -107,6 +107,10 @@ def prepare(words: Sequence[str]) -> list[str]:
                 f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "
                 f"Slates are: {', '.join(SLATES)}."
             )
+        if any(word.startswith("env=") for word in words):
+            raise ValueError(f"slate={name} and env=… both choose the environments: leave one out.")
+        if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*flags, *words}:
+            raise ValueError(f"slate={name} trains on several environments: add -m.")
         new.append(f"env={','.join(SLATES[name])}")
     return [*new, *words, *flags]
 

@@ -228,16 +228,17 @@ _LOOK = 1.0
 _watching: set[int] = set()  # ids of this process and its ancestors that watch their parent
 
 
-def end_with_parent(grace: float = 0.0) -> None:
+def end_with_parent(grace: float = 0.0, parent: int | None = None) -> None:
     """End this process when its parent has ended for any reason.
 
     Args:
         grace: Seconds that a run in this process has to write its checkpoint after SIGTERM.
+        parent: The parent's process id; None: that of the present one.
     """
     if os.getpid() in _watching:
         return
     _watching.add(os.getpid())
-    parent = os.getppid()
+    parent = os.getppid() if parent is None else parent
 
     def watch() -> None:
         # when the parent ends, this process gets another one

@@ -47,6 +47,7 @@ ROLES: dict[str, Role] = {
     "advantage": Role.LEARNING,
     "cost_advantage": Role.LEARNING,
     "critic_update": Role.LEARNING,
+    "dataset.path": Role.LEARNING,  # the data may have moved
     "policy_update": Role.LEARNING,
     "lagrangian": Role.LEARNING,
     "limits": Role.LEARNING,

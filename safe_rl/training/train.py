@@ -88,7 +88,7 @@ def train(
     again = _command_again(run, config, program)
     with _ending_cleanly(run, config), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
-            done = f"{run.directory} has its {config.frames:,} frames already"
+            done = f"{run.directory} has {run.steps:,} frames already"
             print(f"{done}: raise 'frames' to train on.")
             with closing(make_env(node_of(run, config), num_envs=1)) as env:
                 stopped_by, length = None, env.max_episode_steps

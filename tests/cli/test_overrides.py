@@ -41,6 +41,7 @@ WRONG = {
     "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
     "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
     "slate=SG7": "Unknown slate 'SG7'",
+    "slate=SG6": "slate=SG6 trains on several environments: add -m",
     "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
@@ -64,8 +65,26 @@ def test_right_words_pass(arguments):
 
 
 def test_the_value_of_a_flag_is_no_override():
-    words = ["--config-dir", "a=b", "slate=SG6", "seed=0"]
-    assert train.prepare(words) == [f"env={','.join(SLATES['SG6'])}", "seed=0", *words[:2]]
+    words = ["--config-dir", "a=b", "-m", "slate=SG6", "seed=0"]
+    assert train.prepare(words) == [f"env={','.join(SLATES['SG6'])}", "seed=0", *words[:3]]
+
+
+def test_a_slate_and_a_single_environment_are_not_both_chosen():
+    with pytest.raises(ValueError, match="slate=SG6 and env=… both choose the environments"):
+        train.prepare(["-m", "slate=SG6", "env=PointGoal1"])
+
+
+def test_keys_of_swept_transforms_get_no_advice_that_would_fail():
+    words = ["-m", "transforms=[],[saute]", "transforms.saute.kappa=2"]
+    assert "++" not in status_of(*words)
+    assert "'++memory.batch_size=…'" in status_of("-m", "algo=cpo,sac", "memory.batch_size=8")
+
+
+def test_a_file_that_lacks_a_general_key_is_told_so(tmp_path):
+    (tmp_path / "algo").mkdir()
+    (tmp_path / "algo" / "mine.yaml").write_text("# @package _global_\nalgo: {name: mine}\n")
+    message = status_of(f"--config-dir={tmp_path}", "algo=mine", "note=")
+    assert message == "frames is missing: the file of an algorithm sets it."
 
 
 def test_a_folder_in_place_of_the_packages_is_named(tmp_path):

@@ -128,6 +128,7 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
         ({"fames": 3}, "fames"),
         ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
+        ({"import": ["json"]}, "in Python imports=… names the modules"),
         ({"callbacks": 3}, "callbacks must be a list of functions"),
         ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],

@@ -157,7 +157,7 @@ def test_a_sweep_end_to_end(tmp_path, launcher):
     assert [table.parent.name for table in tables] == ["seed0", "seed10"]
     assert not list(tmp_path.glob("PointGoal1/cpo/*/*/progress.csv"))
     before = [table.stat().st_mtime_ns for table in tables]
-    assert sweep(tmp_path, *jobs, status=1).count("has its 120 frames already") == 2
+    assert sweep(tmp_path, *jobs, status=1).count("has 120 frames already") == 2
     assert [table.stat().st_mtime_ns for table in tables] == before
     journals = sorted((tmp_path / "sweeps").iterdir())
     notes = [json.loads(line) for line in journals[0].read_text().splitlines()]
