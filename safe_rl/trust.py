@@ -164,8 +164,8 @@ def instantiate(
         raise TargetError(f"{join_keys(key, '_target_')} is missing: it names the class to build.")
     if plain["_target_"] is None:
         return None
-    trusted, target = _trusted(plain, key), locate(plain["_target_"])
-    known = parameters_of(target) if optional else {}
+    trusted = _trusted(plain, key)
+    known = parameters_of(locate(plain["_target_"])) if optional else {}
     objects |= {k: v for k, v in (optional or {}).items() if k in known and v is not None}
     try:
         part = hydra.utils.instantiate(trusted, _partial_=True)
@@ -173,20 +173,23 @@ def instantiate(
     except InstantiationException as error:
         inner = str(error).partition("full_key: ")[2]
         place, cause = join_keys(key, inner) if inner else key, error.__cause__ or error
-        raise _in_words(cause, place, target) from error
+        at = OmegaConf.create({"at": plain}, flags={"allow_objects": True})
+        built = OmegaConf.select(at, join_keys("at", inner) if inner else "at")
+        raise _in_words(cause, place, built) from error
     except (TypeError, ValueError, ModuleNotFoundError) as error:
-        raise _in_words(error, key, target) from error
+        raise _in_words(error, key, plain) from error
 
 
-def _in_words(error: BaseException, key: str, target: Callable[..., Any]) -> SettingError:
+def _in_words(error: BaseException, key: str, node: Mapping[str, Any]) -> SettingError:
     """An error of a constructor, with the full key of its node or of the wrong setting."""
     unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
     if isinstance(error, SettingError):
         return SettingError(join_keys(key, str(error)))
-    if isinstance(error, TypeError) and unknown:
-        close = did_you_mean(unknown[1], parameters_of(target))
-        name = join_keys(key, unknown[1])
-        return SettingError(f"{name}: {target.__name__} has no such argument.{close}")
+    # what the node does not have is a mistake in the code of the constructor
+    if isinstance(error, TypeError) and unknown and unknown[1] in node:
+        target, name = locate(node["_target_"]), join_keys(key, unknown[1])
+        hint = did_you_mean(unknown[1], parameters_of(target)) or f" Leave it out with '~{name}'."
+        return SettingError(f"{name}: {target.__name__} has no such argument.{hint}")
     words = " ".join(str(error).split())
     return SettingError(f"{key}: {words}" if key else words)
 

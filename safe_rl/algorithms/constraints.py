@@ -12,13 +12,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from safe_rl.checks import parameters_of
 from safe_rl.collectors import EpisodeStatistics
 from safe_rl.naming import did_you_mean, key_name
 from safe_rl.objectives.limits import LimitState, LimitTracker
 from safe_rl.objectives.multipliers import Multiplier, parse_cost_limits
 from safe_rl.objectives.risk import MeasuredCosts, RiskMeasure
 from safe_rl.resumable import Resumable
-from safe_rl.trust import instantiate
+from safe_rl.trust import instantiate, locate
 
 
 class Constraints(Resumable):
@@ -205,6 +206,16 @@ class Constraints(Resumable):
             )
         names = map(key_name, self.keys)
         return {f"{name}_{key}": v for key, v in zip(names, value.tolist(), strict=True)}
+
+
+def check_multiplier(multiplier: Multiplier | None, *nodes: DictConfig) -> None:
+    """Refuse a multiplier that no part takes: the algorithm would not see any cost."""
+    takers = (parameters_of(locate(node._target_)) for node in nodes)
+    if multiplier is not None and not any("multiplier" in names for names in takers):
+        raise ValueError(
+            f"lagrangian: {nodes[0]._target_} has no argument 'multiplier', so that costs would "
+            "have no effect. Derive the loss from one with a multiplier, or set lagrangian=null."
+        )
 
 
 def check_cost_limits(

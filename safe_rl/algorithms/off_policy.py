@@ -14,7 +14,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful, networks_of_target
-from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.constraints import Constraints, check_multiplier
 from safe_rl.algorithms.dataset import fill_replay_buffer
 from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.algorithms.replay_update import ReplayUpdate
@@ -86,6 +86,7 @@ class OffPolicy(Resumable, Algorithm):
             },
             actor_network=networks["actor"],
         )
+        check_multiplier(multiplier, config.loss)
         update = instantiate(config.policy_update, loss=loss)
         buffer = instantiate(
             config.memory,

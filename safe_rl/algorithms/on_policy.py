@@ -20,7 +20,7 @@ from safe_rl.algorithms.algorithm_contract import (
     Stateful,
     networks_of_target,
 )
-from safe_rl.algorithms.constraints import Constraints
+from safe_rl.algorithms.constraints import Constraints, check_multiplier
 from safe_rl.algorithms.losses import LossState
 from safe_rl.algorithms.processor_use import in_parallel
 from safe_rl.collectors import EpisodeStatistics
@@ -89,13 +89,15 @@ class OnPolicy(Algorithm):
                 )
             cost_advantage = instantiate(node, optional, value_network=cost_critic)
         loss = instantiate(config.loss, optional, actor_network=networks["actor"])
+        update = instantiate(config.policy_update, optional, loss=loss)
+        check_multiplier(multiplier, config.loss, config.policy_update)
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,
             multiplier=multiplier,
             advantage=instantiate(config.advantage, value_network=critic),
             cost_advantage=cost_advantage,
-            policy_update=instantiate(config.policy_update, optional, loss=loss),
+            policy_update=update,
             critic_update=instantiate(config.critic_update, loss=CriticLoss(critic, cost_critic)),
         )
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.envs import EnvBase
@@ -22,7 +22,7 @@ from safe_rl.evaluation.episodes import exploration
 from safe_rl.evaluation.loading import load_policy, transforms_of
 from safe_rl.extras import import_extra
 from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
-from safe_rl.models import BehaviourPolicy, ExploringPolicy
+from safe_rl.models import BehaviourPolicy, ExploringPolicy, make_behaviour
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, is_unfinished
@@ -151,6 +151,8 @@ def export_onnx(
             "exported."
         )
     policy = load_policy(run.config, env, checkpoint, torch.device("cpu"))
+    if isinstance(policy, ProbabilisticTensorDictSequential):
+        policy = make_behaviour(policy)
     if len(policy.in_keys) != 1:
         raise ValueError(f"Policies that read {policy.in_keys} cannot be exported, only vectors.")
     if sampled and not isinstance(policy, BehaviourPolicy | ExploringPolicy):

@@ -62,7 +62,7 @@ def make_squashed_actor(
         hidden_sizes: Width of every hidden layer.
         input_scale: Fixed factors of the observation, or None.
         device: Device of the parameters.
-        encoder: Module before the perceptron, which takes the entries `in_keys`; it replaces
+        encoder: Module before the perceptron, which takes the entries `in_keys`, scaled by
             `input_scale`.
         in_keys: Keys of the observation.
 

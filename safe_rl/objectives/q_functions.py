@@ -41,7 +41,9 @@ def check_ensemble(network: Any, what: str) -> None:
     """Refuse a network that is not an ensemble of Q functions."""
     if not isinstance(network, Ensemble):
         raise ValueError(
-            f"The {what} has to be a safe_rl.models.QEnsemble, not a {type(network).__name__}."
+            f"The {what} has to be a safe_rl.models.QEnsemble, or a module with its attributes "
+            f"num_networks and in_keys and its methods values and layers, unlike "
+            f"{type(network).__name__}."
         )
 
 

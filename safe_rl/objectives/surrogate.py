@@ -72,6 +72,8 @@ class SurrogateLoss(Checked, SharesTensors):
 
     limits: LimitState | None = None
 
+    #: Entries of the batch that a subclass reads besides those of `in_keys`.
+    extra_in_keys: tuple[NestedKey, ...] = ()
     #: Entries besides ``loss_objective`` that a subclass adds.
     extra_out_keys: tuple[str, ...] = ()
 
@@ -135,7 +137,8 @@ class SurrogateLoss(Checked, SharesTensors):
         keys = self.tensor_keys
         costs = [keys.cost_advantage] if self.has_costs else []
         behaviour = [keys.action, keys.sample_log_prob, *self.behaviour_keys.values()]
-        return [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
+        read = [*self.actor_network.in_keys, *behaviour, keys.advantage, *costs]
+        return [*read, *self.extra_in_keys]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

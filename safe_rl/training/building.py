@@ -198,7 +198,8 @@ def begin_from(
     if absent := [name for name in taken if name not in weights]:
         raise CheckpointError(
             f"{checkpoint} has no {' and no '.join(absent)}, which this run needs: init_from takes "
-            "a run whose algorithm has trained all networks of this one, unlike algo=bc."
+            "a run that has trained all networks of this one: algo=bc and exported policies have "
+            "only the actor."
         )
     for name, network in taken.items():
         _check_shapes(name, network.state_dict(), weights[name], checkpoint)

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.algorithms.algorithm_contract import Algorithm, Stateful
 from safe_rl.algorithms.processor_use import fast_products, torch_threads
+from safe_rl.checks import SettingError
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
 from safe_rl.runs.writing import RunWriter
@@ -224,6 +225,9 @@ class Trainer:
             self._recording.write(self.progress.epoch, batch, begun=begun)
         with fast_products():
             learned = self.algorithm.learn(batch, episodes)
+        measured = episodes.scalars()
+        if taken := learned.keys() & measured.keys():
+            raise SettingError(f"algo: 'learn' returned {min(taken)}, which training measures.")
         end = time.perf_counter()
         before = self.progress.steps
         self.progress.epoch += 1
@@ -236,7 +240,7 @@ class Trainer:
         return {
             "epoch": self.progress.epoch,
             "steps": self.progress.steps,
-            **episodes.scalars(),
+            **measured,
             **learned,
             **evaluated,
             "time_collect": collected - start,

@@ -36,7 +36,15 @@ def test_configurations_are_shown(command):
         (["-m", "hydra.sweep.dir="], "hydra.sweep.dir= is empty"),
         (["transforms=[saute,saute]"], "a transform is there twice"),
         (["logger.exp_name=3"], "logger.exp_name=3: it must be a valid string"),
-        (["logger._target_=torch.optim.Adam"], "logger.exp_name: Adam has no such argument"),
+        (["logger._target_=torch.optim.Adam"], "logger.exp_name: Adam has no such argument. Leave"),
+        (
+            ["policy_update.optimizer._target_=torch.optim.RMSprop"],
+            "policy_update: RMSprop.__init__() got an unexpected keyword argument 'fused'",
+        ),
+        (
+            ["loss._target_=safe_rl.objectives.PPOLoss", "~loss.cost_clipping"],
+            "lagrangian: safe_rl.objectives.PPOLoss has no argument 'multiplier'",
+        ),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line_and_leaves_nothing(command, overrides, words):

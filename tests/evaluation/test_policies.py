@@ -242,6 +242,14 @@ def test_what_is_certified_is_what_is_exported(run, tmp_path, capsys, determinis
     assert json.loads(texts["certificate"]) is None
 
 
+def test_the_samples_of_a_plain_actor_are_exported_too(run, tmp_path, monkeypatch):
+    """An algorithm of one's own may have one as its policy."""
+    monkeypatch.setattr("safe_rl.algorithms.on_policy.make_behaviour", lambda actor: actor)
+    session = exported(run, tmp_path / "policy.onnx", "checkpoint=last", "actions=sampled")
+    (actions,) = session.run(["action"], {"observation": np.zeros((2, 60), np.float32)})
+    assert not np.array_equal(*actions)
+
+
 def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     assert export([str(run)]) == 2
     assert export([str(run), str(tmp_path / "a.onx")]) == 1

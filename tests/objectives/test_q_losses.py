@@ -199,7 +199,7 @@ def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused
     critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
     networks = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8]), make_q()
     multiplier = lagrange(1.0, 1.0)
-    with pytest.raises(ValueError, match=r"cost critic has to be a safe_rl.*, not a ValueOp"):
+    with pytest.raises(ValueError, match=r"cost critic has to be a safe_rl.*, unlike ValueOp"):
         SACLagrangianLoss(*networks, critic, multiplier=multiplier, cost_keys=COSTS, **SAC)
     with pytest.raises(ValueError, match="2 multipliers for the costs"):
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)

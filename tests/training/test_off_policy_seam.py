@@ -13,6 +13,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.modules import RandomPolicy
 
 from safe_rl.algorithms import Algorithm
+from safe_rl.checks import SettingError
 from safe_rl.evaluation.episodes import collect_episodes
 from safe_rl.evaluation.loading import load_policy
 from safe_rl.runs.run import Run
@@ -105,6 +106,12 @@ def test_its_run_is_written_transferred_and_evaluated(make_trainer, tmp_path):
     assert policy.bias.tolist() == pytest.approx([0.08, 0.08])
     episodes = collect_episodes(env, policy, 3, env.cost_keys, deterministic=False)
     assert episodes.lengths.tolist() == [20, 20, 20]
+
+
+def test_a_column_that_training_measures_is_not_replaced(make_trainer, monkeypatch):
+    monkeypatch.setattr(Drifting, "learn", lambda self, *_: {"episode_cost": -7.0})
+    with pytest.raises(SettingError, match="'learn' returned episode_cost, which training"):
+        make_trainer("run").run()
 
 
 def test_it_resumes_with_its_buffer_as_if_it_had_never_stopped(make_trainer, tmp_path):

@@ -44,7 +44,7 @@ _MUJOCO = {"backend": "mujoco", "parallel": False}
 TORCHRL_CLASSES: dict[str, Mapping[str, Any]] = {
     "PendulumEnv": {},
     "FinancialRegimeEnv": {},
-    **dict.fromkeys(("AntEnv", "HopperEnv", "HumanoidEnv", "Walker2dEnv"), _MUJOCO),
+    **dict.fromkeys(("AntEnv", "HumanoidEnv", "Walker2dEnv"), _MUJOCO),
 }
 """Classes of `torchrl.envs` that need no `import=`, and their default arguments."""
 

@@ -1,39 +1,25 @@
-"""The example of a loss and a risk measure of one's own: definitions, and whole runs."""
+"""The example of a risk measure of one's own, and losses of TorchRL: definitions and whole runs."""
 
 import math
 
-import custom_loss
+import custom_risk
 import pytest
 import torch
 from omegaconf import OmegaConf
 from point_mass_runs import point_mass_trainer
 from run_configs import CONF
-from samples import limit_state
-from tensordict import TensorDict
 
 from safe_rl import trust
 from safe_rl.algorithms import Constraints
 from safe_rl.evaluation.settings import certificate_options
-from safe_rl.models import make_actor
+from safe_rl.objectives import PPOLoss
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import read_table
 from safe_rl.training.train import certify_finished
 from safe_rl.trust import allow
 
 EXAMPLES = CONF.parent / "examples"
-allow("custom_loss")
-
-
-def test_the_penalty_of_a_policy_that_has_not_moved():
-    actor = make_actor(3, 2, hidden_sizes=[16], initial_log_std=-0.5)
-    loss = custom_loss.QuadraticPenaltyLoss(actor, kappa=100.0, clip_epsilon=0.2, entropy_coeff=0.0)
-    with torch.no_grad():
-        batch = actor(TensorDict(observation=torch.randn(50, 3), batch_size=[50]))
-    batch["advantage"], batch["cost_advantage"] = torch.randn(50, 1), torch.zeros(50, 2)
-    nothing_known = limit_state(torch.nan, torch.nan)
-    assert loss(loss.prepare(batch, nothing_known))["loss_penalty"] == 0
-    losses = loss(loss.prepare(batch, limit_state(20.0, -3.0, length=100.0)))
-    torch.testing.assert_close(losses["loss_penalty"].detach(), torch.tensor(100 * 0.2**2))
+allow("custom_risk")
 
 
 def test_measured_costs_sum_to_mean_and_semideviation():
@@ -41,7 +27,7 @@ def test_measured_costs_sum_to_mean_and_semideviation():
     ends = torch.zeros(6, 10, dtype=torch.bool)
     ends[:, -1] = True
     totals = costs.sum(1)
-    risk = custom_loss.UpperSemideviation(torch.tensor([1.0]), weight=0.5, decay=0.0)
+    risk = custom_risk.UpperSemideviation(torch.tensor([1.0]), weight=0.5, decay=0.0)
     measured = risk(costs, ends, torch.zeros(6, 1), totals).costs.sum(1)
     expected = totals.mean() + 0.5 * (totals - totals.mean()).clamp_min(0).mean()
     torch.testing.assert_close(measured.mean(), expected)
@@ -49,7 +35,7 @@ def test_measured_costs_sum_to_mean_and_semideviation():
 
 def test_it_trains_with_several_costs(tmp_path):
     trainer = point_mass_trainer(
-        tmp_path, f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]", "algo=quadratic",
+        tmp_path, f"hydra.searchpath=[file://{EXAMPLES / 'conf'}]", "algo=p3o",
         "risk=semideviation", "cost_limits={cost_hazards: 1, cost_north: 0.5}",
     )  # fmt: skip
     trainer.run()
@@ -62,6 +48,20 @@ def test_it_trains_with_several_costs(tmp_path):
     assert said[0].startswith("Not certified: there is no test for limits on UpperSemideviation.")
     own = OmegaConf.merge(run.config, {"risk": {"tail": 0.2}})
     assert certificate_options(own).tail == 1.0
+
+
+class ReadsCosts(PPOLoss):
+    extra_in_keys = (("next", "cost"),)
+
+    def _surrogates(self, tensordict, log_weight):
+        assert tensordict["next", "cost"].shape == tensordict["advantage"].shape
+        return super()._surrogates(tensordict, log_weight)
+
+
+def test_a_loss_gets_the_entries_that_it_names(tmp_path, monkeypatch):
+    monkeypatch.setitem(trust._ROOMS, __name__, None)
+    trainer = point_mass_trainer(tmp_path, "algo=ppo", f"loss._target_={__name__}.ReadsCosts")
+    assert trainer.epoch(iter(trainer.collector))["policy_num_steps"] > 0
 
 
 @pytest.mark.parametrize("name", ["A2CLoss", "ClipPPOLoss"])
