@@ -174,7 +174,8 @@ def instantiate(
         inner = str(error).partition("full_key: ")[2]
         place, cause = join_keys(key, inner) if inner else key, error.__cause__ or error
         at = OmegaConf.create({"at": plain}, flags={"allow_objects": True})
-        built = OmegaConf.select(at, join_keys("at", inner) if inner else "at")
+        # Hydra's key of an item of a list cannot be found again
+        built = OmegaConf.select(at, join_keys("at", inner) if inner else "at") or {}
         raise _in_words(cause, place, built) from error
     except (TypeError, ValueError, ModuleNotFoundError) as error:
         raise _in_words(error, key, plain) from error
@@ -185,11 +186,12 @@ def _in_words(error: BaseException, key: str, node: Mapping[str, Any]) -> Settin
     unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
     if isinstance(error, SettingError):
         return SettingError(join_keys(key, str(error)))
-    # what the node does not have is a mistake in the code of the constructor
     if isinstance(error, TypeError) and unknown and unknown[1] in node:
         target, name = locate(node["_target_"]), join_keys(key, unknown[1])
-        hint = did_you_mean(unknown[1], parameters_of(target)) or f" Leave it out with '~{name}'."
-        return SettingError(f"{name}: {target.__name__} has no such argument.{hint}")
+        known = parameters_of(target)
+        if unknown[1] not in known:  # else the mistake is in the code of the constructor
+            hint = did_you_mean(unknown[1], known) or f" Leave it out with '~{name}'."
+            return SettingError(f"{name}: {target.__name__} has no such argument.{hint}")
     words = " ".join(str(error).split())
     return SettingError(f"{key}: {words}" if key else words)
 

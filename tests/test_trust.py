@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from safe_rl import trust
 from safe_rl.algorithms import MinibatchUpdate
+from safe_rl.checks import SettingError
 from safe_rl.trust import TargetError, instantiate, locate
 
 ADAM = {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 0.1}
@@ -63,6 +64,13 @@ def test_a_null_target_is_nothing_and_a_missing_one_an_error():
         instantiate(OmegaConf.create({"loss": {"clip_epsilon": 0.2}}).loss)
     with pytest.raises(TargetError, match=r"^_target_ is missing"):
         instantiate(3)
+
+
+def test_an_unknown_argument_of_an_item_of_a_list_is_named():
+    rate = {"_target_": "safe_rl.algorithms.KLAdaptiveRate", "widht": 1}
+    node = {"_target_": "torch.optim.Adam", "params": [rate]}
+    with pytest.raises(SettingError, match=r"^params0: .*unexpected keyword argument 'widht'"):
+        instantiate(node)
 
 
 def test_partial_nodes_wait_for_their_arguments():

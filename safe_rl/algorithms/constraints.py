@@ -209,12 +209,12 @@ class Constraints(Resumable):
 
 
 def check_multiplier(multiplier: Multiplier | None, *nodes: DictConfig) -> None:
-    """Refuse a multiplier that no part takes: the algorithm would not see any cost."""
+    """Refuse a multiplier that no part takes: the policy would not learn from costs."""
     takers = (parameters_of(locate(node._target_)) for node in nodes)
     if multiplier is not None and not any("multiplier" in names for names in takers):
         raise ValueError(
-            f"lagrangian: {nodes[0]._target_} has no argument 'multiplier', so that costs would "
-            "have no effect. Derive the loss from one with a multiplier, or set lagrangian=null."
+            f"lagrangian: {nodes[0]._target_} has no argument 'multiplier', so that it would have "
+            "no effect. Derive the loss from one with a multiplier, or add '~lagrangian'."
         )
 
 

@@ -27,7 +27,7 @@ from safe_rl.collectors import (
 from safe_rl.files import read_config
 from safe_rl.models.replay_networks import bounded_actions
 
-_OF_SAFETY_GYMNASIUM = re.compile(r"(?:Safety|Offline)(\w+)Gymnasium-v\d")  # names of files
+_OF_SAFETY_GYMNASIUM = re.compile(r"(?:Offline|Safety)+(\w+)Gymnasium-v\d")  # names of files
 _ROUNDING = 1e-5  # of the width of the bounds: actions were computed in single precision
 
 
@@ -179,8 +179,9 @@ def _check_costs_and_ends(steps: TensorDictBase, env: EnvBase) -> None:
             f"it has {lengths.max():,} steps without an end, and episodes of this environment have "
             f"at most {longest:,}: mark every end in terminals or timeouts."
         )
-    terminated = steps["next", "terminated"].flatten()[ends][lengths == longest]
-    if len(terminated) > 1 and terminated.all():
+    full = ends[lengths == longest]
+    full = full[steps["next", "done"].flatten()[full]]  # the last row may go on
+    if len(full) > 1 and steps["next", "terminated"].flatten()[full].all():
         raise ValueError(
             f"its episodes of {longest} steps terminate, so these are time-outs, after which "
             "values are bootstrapped: mark them in timeouts only."

@@ -86,7 +86,8 @@ class OffPolicy(Resumable, Algorithm):
             },
             actor_network=networks["actor"],
         )
-        check_multiplier(multiplier, config.loss)
+        if cls is OffPolicy:  # a class of the user's may use it elsewhere
+            check_multiplier(multiplier, config.loss)
         update = instantiate(config.policy_update, loss=loss)
         buffer = instantiate(
             config.memory,

@@ -90,7 +90,8 @@ class OnPolicy(Algorithm):
             cost_advantage = instantiate(node, optional, value_network=cost_critic)
         loss = instantiate(config.loss, optional, actor_network=networks["actor"])
         update = instantiate(config.policy_update, optional, loss=loss)
-        check_multiplier(multiplier, config.loss, config.policy_update)
+        if cls is OnPolicy and num_costs:  # a class of the user's may use it elsewhere
+            check_multiplier(multiplier, config.loss, config.policy_update, config.cost_advantage)
         return cls(
             **{"cost_critic": None, **networks},
             constraints=constraints,

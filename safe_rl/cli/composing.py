@@ -130,6 +130,8 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         return _unknown_choice(error)
     if str(error).startswith("Config group override must be"):
         return _unnamed_choice(words) or str(error)
+    if str(error).startswith("Ambiguous value for argument 'env="):
+        return "env=A,B and slate=… are several environments: add -m."
     if type(error) is AttributeError:
         missing = re.search(r"full_key: (\w+)\.\S+\s+object_type=General", str(error))
         if missing is None:

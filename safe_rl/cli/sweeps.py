@@ -119,7 +119,7 @@ class Summary(Callback):
     def on_job_start(self, config: DictConfig, **_: Any) -> None:
         """Note that a job has begun; another line follows unless it is interrupted."""
         if config.hydra.mode == RunMode.MULTIRUN:
-            # not by the parent's id: the sweep may have been killed before this
+            # joblib's jobs are children of the sweep, which may have been killed before this
             if os.getpid() != self._process and "n_jobs" in config.hydra.launcher:
                 from safe_rl.collectors.workers import end_with_parent  # with torch
 

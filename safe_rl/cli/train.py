@@ -96,6 +96,11 @@ def prepare(words: Sequence[str]) -> list[str]:
     pairs = list(pairwise(["", *words]))
     flags = [word for before, word in pairs if _is_of_flags(before, word)]
     words = [word for before, word in pairs if not _is_of_flags(before, word)]
+    others = [word for word in words if word.startswith("env=")]
+    if slates and (runs or others or len(slates) > 1):
+        raise ValueError(
+            f"slate={slates[0]} chooses the environments: leave out resume=, env= and other slates."
+        )
     if runs:
         directory = Path(runs[-1]).expanduser().absolute()
         ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, [*words, *flags]))
@@ -107,10 +112,6 @@ def prepare(words: Sequence[str]) -> list[str]:
                 f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "
                 f"Slates are: {', '.join(SLATES)}."
             )
-        if any(word.startswith("env=") for word in words):
-            raise ValueError(f"slate={name} and env=… both choose the environments: leave one out.")
-        if not {"-m", "--multirun", "hydra.mode=MULTIRUN"} & {*flags, *words}:
-            raise ValueError(f"slate={name} trains on several environments: add -m.")
         new.append(f"env={','.join(SLATES[name])}")
     return [*new, *words, *flags]
 

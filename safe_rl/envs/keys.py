@@ -111,9 +111,11 @@ def is_cost(name: Any) -> bool:
     return name == COST or str(name).startswith(f"{COST}_")
 
 
-_TOTALS = ("total", "return", "cumulative", "episode")
 #: These names usually mean something else than the cost of a step. `cost_keys` can still name them.
-_NOT_OF_STEPS = {f"{COST}_{name}" for name in ("limit", "threshold", "budget", *_TOTALS)}
+_NOT_OF_STEPS = {
+    *("cost_limit", "cost_threshold", "cost_budget"),
+    *("cost_total", "cost_return", "cost_cumulative", "cost_episode"),
+}
 
 
 def found_costs(names: Iterable[Any]) -> list[str]:

@@ -225,29 +225,26 @@ class Trainer:
             self._recording.write(self.progress.epoch, batch, begun=begun)
         with fast_products():
             learned = self.algorithm.learn(batch, episodes)
-        measured = episodes.scalars()
-        if taken := learned.keys() & measured.keys():
-            raise SettingError(f"algo: 'learn' returned {min(taken)}, which training measures.")
         end = time.perf_counter()
-        before = self.progress.steps
+        steps_before = self.progress.steps
         self.progress.epoch += 1
         self.progress.steps += episodes.steps
         self.progress.seconds += end - start
         evaluated: dict[str, float] = {}
         if self._evaluation is not None:
             with torch_threads(1):
-                evaluated = self._evaluation(before, self.progress.steps)
-        return {
-            "epoch": self.progress.epoch,
-            "steps": self.progress.steps,
-            **measured,
-            **learned,
-            **evaluated,
+                evaluated = self._evaluation(steps_before, self.progress.steps)
+        progress = {"epoch": self.progress.epoch, "steps": self.progress.steps}
+        times = {
             "time_collect": collected - start,
             "time_learn": end - collected,
             "time_total": self.progress.seconds,
             "steps_per_second": episodes.steps / (end - start),
         }
+        before, after = progress | episodes.scalars(), evaluated | times
+        if taken := learned.keys() & (before | after).keys():
+            raise SettingError(f"algo: 'learn' returned {min(taken)}, which training measures.")
+        return before | learned | after
 
     def _save(self) -> None:
         self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})

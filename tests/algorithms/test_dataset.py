@@ -137,7 +137,11 @@ def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
     with pytest.raises(ValueError, match=time_outs):
         learned_actions(path, env)
     with h5py.File(path, "a") as file:
+        file["terminals"][...] = np.isin(np.arange(60), (19, 39))  # nor is the last one marked
         file["timeouts"][...] = False
+    with pytest.raises(ValueError, match=time_outs):
+        learned_actions(path, env)
+    with h5py.File(path, "a") as file:
         file["terminals"][...] = np.arange(60) == 9
         del file["next_observations"]
     with pytest.raises(ValueError, match=r"50 steps without an end, and episodes .* at most 20"):

@@ -41,7 +41,6 @@ WRONG = {
     "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
     "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
     "slate=SG7": "Unknown slate 'SG7'",
-    "slate=SG6": "slate=SG6 trains on several environments: add -m",
     "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
     "frames=${nowhere}": "nowhere",
     "frames=[1": r"'frames=\[1' cannot be read",
@@ -70,13 +69,17 @@ def test_the_value_of_a_flag_is_no_override():
 
 
 def test_a_slate_and_a_single_environment_are_not_both_chosen():
-    with pytest.raises(ValueError, match="slate=SG6 and env=… both choose the environments"):
-        train.prepare(["-m", "slate=SG6", "env=PointGoal1"])
+    for other in ("env=PointGoal1", "slate=SGPoint", "resume=runs/mine"):
+        with pytest.raises(ValueError, match="chooses the environments: leave out resume=, env="):
+            train.prepare(["-m", "slate=SG6", other])
+    assert status_of("slate=SG6") == "env=A,B and slate=… are several environments: add -m."
 
 
 def test_keys_of_swept_transforms_get_no_advice_that_would_fail():
     words = ["-m", "transforms=[],[saute]", "transforms.saute.kappa=2"]
-    assert "++" not in status_of(*words)
+    message = status_of(*words)
+    assert "no key 'transforms.saute'" in message
+    assert "++" not in message
     assert "'++memory.batch_size=…'" in status_of("-m", "algo=cpo,sac", "memory.batch_size=8")
 
 

@@ -124,7 +124,9 @@ class CheckedSteps(gymnasium.Wrapper):
         uncounted = [key for key in info if is_cost(key) and key not in self._cost_keys]
         if uncounted and self._watch:
             self._watch = False
-            kept = " 'cost' is taken as the environment gives it." if COST in info else ""
+            kept = (
+                " 'cost' is taken as the environment gives it." if COST in self._cost_keys else ""
+            )
             warnings.warn(
                 # without the step, which differs among rows: Python shows equal warnings once
                 f"info['{uncounted[0]}'] is not counted as a cost, because it is not in "
