@@ -206,7 +206,7 @@ def _read_flat(path: Path | str, nodes: Mapping[str, Any]) -> Arrays:
     arrays = _check_shapes(path, _arrays(path, nodes, _FLAT))
     here = arrays["observation"]
     ends = (arrays["next", "terminated"] | arrays["next", "truncated"]).reshape(-1)
-    ends[-1:] = True
+    ends[-1:] = True  # no row follows the last one
     is_given = "next_observations" in nodes
     following = _values(path, nodes["next_observations"]) if is_given else np.roll(here, -1, 0)
     arrays = _check_shapes(path, {**arrays, ("next", "observation"): following})
