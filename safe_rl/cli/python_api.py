@@ -203,7 +203,7 @@ def load(
         >>> run.policy(run.env.reset())["action"].shape
         torch.Size([1, 2])
     """
-    run = Run(find_run(directory), checkpoint)
+    run = Run(find_run(directory).absolute(), checkpoint)
     check_imports(run.config, imports, run.directory)
     import_modules(imports)
     run.find_checkpoint(checkpoint)

@@ -222,6 +222,8 @@ def _refuse_taken(what: str, name: str) -> None:
 def _refuse_unknown(
     what: str, names: Iterable[str], known: Collection[str], remedy: str = "Register it first."
 ) -> None:
+    if isinstance(names, str):
+        raise ConfigError(f"'{names}' must stand in a tuple: ('{names}',), with a comma.")
     for name in (name for name in names if name not in known):
         raise ConfigError(f"There is no {what} '{name}'.{did_you_mean(name, known)} {remedy}")
 

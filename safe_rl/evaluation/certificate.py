@@ -73,8 +73,9 @@ class Certificate:
 
     @property
     def has_bounds(self) -> bool:
-        """Whether every mean has a bound; without one, more training cannot help."""
-        return all(math.isfinite(bound) for bound, _ in self.verdict.bounds.values())
+        """Whether every mean can have a bound; if one cannot, more training does not help."""
+        bounds = [bound for bound, _ in self.verdict.bounds.values()]
+        return all(map(math.isfinite, [self.fewest, *bounds]))
 
     def _bound_text(self, name: str) -> str:
         bound, limit = self.verdict.bounds[name]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections import defaultdict
-from collections.abc import Hashable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -124,14 +124,14 @@ def group_runs(
     result is folder -> the reason why a run is left out.
     """
     environments = _environment_names(runs, suite)
+    titles = _titles({run.algorithm for run in runs}, labels)
     settings = _settings_of_names(runs, environments)
     cells: dict[tuple[str, str], dict[int, Experiment]] = defaultdict(dict)
     skipped: dict[Path, str] = {}
     # of several runs with one seed, the longest is kept; among equal ones the last by name
     for run in sorted(runs, key=lambda run: (run.steps, run.directory)):
         environment = environments[run.directory]
-        title = clean(labels.get(run.algorithm) or title_of(run.algorithm), 80)
-        benchmark = suite.name_of(run.settings["env"])
+        title, benchmark = titles[run.algorithm], suite.name_of(run.settings["env"])
         experiment = Experiment(environment, title, settings[run.directory], benchmark, (run,))
         cell = cells[environment, experiment.algorithm]
         if run.seed in cell:
@@ -141,6 +141,13 @@ def group_runs(
     ordered = [[cell[seed] for seed in sorted(cell)] for cell in cells.values()]
     experiments = [replace(seeds[0], runs=tuple(e.runs[0] for e in seeds)) for seeds in ordered]
     return sorted(experiments, key=_order), skipped
+
+
+def _titles(algorithms: Iterable[str], labels: Mapping[str, str]) -> dict[str, str]:
+    """Name in ``conf/algo`` -> name in tables; with the first in brackets where others share it."""
+    titles = {name: clean(labels.get(name) or title_of(name), 80) for name in algorithms}
+    times = Counter(titles.values())
+    return {n: f"{t} ({clean(n, 80)})" if times[t] > 1 else t for n, t in titles.items()}
 
 
 def _order(experiment: Experiment) -> tuple[Hashable, ...]:

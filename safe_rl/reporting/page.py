@@ -124,8 +124,9 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     """
     runs, skipped = find_runs(root, unfinished=options.unfinished)
     own = {run.environment for run in runs}
-    for place in (Path(place).expanduser() for place in listed(options.baselines)):
-        added, missed = _baselines(place, own)
+    places = [Path(place).expanduser().resolve() for place in listed(options.baselines)]
+    for place in places:
+        added, missed = _baselines(place, own, _name_among(place, places))
         runs, skipped = [*runs, *added], skipped | missed
     algorithms, width = listed(options.algos), options.width
     known = sorted({run.algorithm for run in runs})
@@ -158,12 +159,21 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     return Report(experiments, sections, skipped)
 
 
-def _baselines(place: Path, environments: Collection[str]) -> tuple[list[Run], dict[Path, str]]:
-    """Finished runs of another folder in some environments, with its name; and what is left out."""
+def _name_among(place: Path, others: Collection[Path]) -> str:
+    """The end of a folder's path that no other folder has."""
+    ends = (Path(*place.parts[-length:]) for length in range(1, len(place.parts)))
+    alone = (end for end in ends if sum(other.match(str(end)) for other in {*others}) == 1)
+    return str(next(alone, place))
+
+
+def _baselines(
+    place: Path, environments: Collection[str], name: str
+) -> tuple[list[Run], dict[Path, str]]:
+    """Finished runs of another folder in some environments, and what is left out."""
     found, skipped = find_runs(place)
     runs = [run for run in found if run.environment in environments and run.is_finished]
     for run in runs:
-        run.source = clean(place.resolve().name, 40)
+        run.source = clean(name, 80)
     if not runs:
         skipped[place] = "no baselines: it has no finished run on an environment of these runs"
     return runs, skipped

@@ -157,13 +157,15 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
 
 
 def _dominating(record: Record, records: Sequence[Record]) -> list[str]:
+    alike = ("slate", "there", "fewest_steps", "most_steps")
+
     def figures(scores: Record) -> tuple[float, float]:
         return scores["episode_return"], -scores["cost_rate"]
 
     return [
         other["algorithm"]
         for other in records
-        if (other["slate"], other["there"]) == (record["slate"], record["there"])
+        if all(other[name] == record[name] for name in alike)
         and max(other["violation"], record["violation"]) <= benchmark.NOISE_OF_ZERO
         and figures(other) != figures(record)
         and all(a >= b for a, b in zip(figures(other), figures(record), strict=True))

@@ -273,6 +273,21 @@ def test_baselines_stand_beside_the_runs_of_the_same_environments_and_are_not_ar
     assert list(pandas.read_csv(out / "final_PointGoal1.csv").algorithm) == ["PPO"]
 
 
+def test_algorithms_and_baselines_that_share_a_name_stay_apart(tmp_path):
+    write_run(tmp_path / "mine", algo="cpo")
+    for place, value in (("x", 10.0), ("y", 30.0)):
+        write_run(tmp_path / place / "runs", algo="cpo", returns=[value])
+        write_run(tmp_path / place / "runs", algo="ppo", seed=1, returns=[value + 1])
+    places = ",".join(str(tmp_path / place / "runs") for place in "xy")
+    words = [f"baselines={places}", f"out={tmp_path}", "labels={cpo: Same, ppo: Same}"]
+    assert main([str(tmp_path / "mine"), *words]) == 0
+    table = pandas.read_csv(tmp_path / "final_PointGoal1.csv").set_index("algorithm")
+    assert table.episode_return.to_dict() == {
+        **{"Same (cpo)": 1.0, "Same (cpo) (x/runs)": 10.0, "Same (cpo) (y/runs)": 30.0},
+        **{"Same (ppo) (x/runs)": 11.0, "Same (ppo) (y/runs)": 31.0},
+    }
+
+
 def test_pictures_and_tables_for_papers(tmp_path):
     for algo in ("cpo", "ppo"):
         write_run(tmp_path, algo=algo, returns=(1.0, 2.0), costs=(3, 4), rates=(0.1, 0.1))

@@ -34,7 +34,8 @@ class SensorNoise(ConstraintTransform):
     """Add normally distributed noise to observations, also in evaluation.
 
     Every draw depends only on its row's seed, the episode, the step and the column. Therefore
-    resumed runs are identical, and rows are independent. Pictures of integers are not changed.
+    resumed runs are identical, and rows are independent. Pictures of integers are not changed. In
+    TorchRL's own `TransformedEnv` the seed is drawn from torch's generator; `set_seed` keeps it.
 
     Args:
         std: Standard deviation of the noise, in the units of the observation; or the lowest and

@@ -180,7 +180,7 @@ class Saute(ConstraintTransform):
         observed = observation_spec["observation"]
         if isinstance(observed, Composite):
             shape = (*observation_spec.shape, len(self._budgets))
-            observed[BUDGET] = Unbounded(shape=shape, device=observed.device)
+            observed[BUDGET] = Unbounded(shape=shape, device=observed.device, dtype=torch.float32)
             return observation_spec
         return widen(observation_spec, len(self._budgets), "A budget")
 
