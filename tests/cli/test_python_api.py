@@ -257,6 +257,10 @@ def test_mappings_that_go_together_and_numbers_of_numpy_are_written_as_hydra_tak
 def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(run.directory.parent))
     assert safe_rl.load(f"~/{run.directory.name}").directory == run.directory
+    monkeypatch.chdir(run.directory)
+    again = safe_rl.load(".")
+    monkeypatch.chdir(tmp_path)
+    assert again.policy is not None
     page = safe_rl.report(run.directory, out="~/page", archive="~/kept")
     assert {page.parent, Path("~/kept").expanduser()} <= {*run.directory.parent.iterdir()}
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -190,6 +190,8 @@ def test_tasks_bring_objects_and_keys():
     assert float(result["reward"]) == pytest.approx(3.0 * float(after["qpos"][0, 0]), rel=1e-5)
     with pytest.raises(ConfigError, match=r"'folow'.*'follow'"):
         make({"task": "folow"})
+    with pytest.raises(ConfigError, match=r"'goal' must stand in a tuple: \('goal',\)"):
+        register_task("visit", Task(FOLLOW.reward, elements="goal"))
 
 
 def test_tasks_with_goals_of_their_own():

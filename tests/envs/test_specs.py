@@ -9,9 +9,10 @@ from torchrl.envs import ConditionalSkip, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import SUITE, SafetyGymEnv, env_node, from_gymnasium, make_env, resolve
-from safe_rl.envs.transforms import ObservedCosts
+from safe_rl.envs.transforms import ObservedCosts, Saute
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
+SAUTE = Saute({"cost": 5.0}, discount=0.9, unsafe_reward=0.0, rescale_budgets=True)
 # By hand from sections 4, 8 and 9 of the benchmark's description: names and sizes.
 COMMON_SENSORS = {"accelerometer": 3, "gyro": 3, "magnetometer": 3, "velocimeter": 3}
 LEGS = [joint for leg in "1234" for joint in (f"hip_{leg}_y", f"hip_{leg}_z", f"ankle_{leg}")]
@@ -143,6 +144,8 @@ def test_specs_hold_with_another_default_dtype(env_name):
         else:
             env = make_env(env_name, num_envs=2, transforms={"costs": ObservedCosts(0.9)})
         check_env_specs(env)
+        if env_name == "PointGoal1":
+            check_env_specs(make_env(env_name, observation_flatten=False, transforms={"s": SAUTE}))
     finally:
         torch.set_default_dtype(torch.float32)
 

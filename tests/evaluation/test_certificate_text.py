@@ -31,6 +31,8 @@ def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
     # 120 can never suffice
     assert "at least 561 are needed" in str(replace(certificate, fewest=561))
     assert "No number of episodes" in str(replace(certificate, fewest=math.inf))
+    assert certificate.has_bounds
+    assert not replace(certificate, fewest=math.inf).has_bounds
     above = replace(verdict, bounds={"mean_cost": (math.inf, 5.0)}, shortfalls={"mean_cost": 5})
     said = str(replace(certificate, verdict=above))
     assert "mean_cost has no bound: costs are NaN, or above those that the specs" in said
