@@ -49,10 +49,10 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     if target.suffix not in ("", ".onnx"):
         raise OptionError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
-        target.parent.mkdir(parents=True, exist_ok=True)
         check_imports(run.config, modules, run.directory)
         checkpoint = run.find_checkpoint(which)
         sampled = _choose_actions(run, checkpoint, options.actions)
+        target.parent.mkdir(parents=True, exist_ok=True)
         with closing(run.make_env()) as env:
             export_onnx(run, env, checkpoint, target, sampled=sampled)
         if names := ", ".join(transforms_of(run.config)):

@@ -203,7 +203,7 @@ def load(
         >>> run.policy(run.env.reset())["action"].shape
         torch.Size([1, 2])
     """
-    run = Run(find_run(directory).absolute(), checkpoint)
+    run = Run(find_run(directory), checkpoint)
     check_imports(run.config, imports, run.directory)
     import_modules(imports)
     run.find_checkpoint(checkpoint)
@@ -244,7 +244,8 @@ class Run(RecordedRun):
     """
 
     def __init__(self, directory: Path | str, checkpoint: str = "last") -> None:
-        super().__init__(directory)
+        # it is read later, perhaps from another working directory
+        super().__init__(Path(directory).absolute())
         self.checkpoint = checkpoint
 
     @cached_property

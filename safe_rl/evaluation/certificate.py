@@ -72,8 +72,8 @@ class Certificate:
         return "\n".join([head, *rows, self._not_covered_text()])
 
     @property
-    def has_bounds(self) -> bool:
-        """Whether every mean can have a bound; if one cannot, more training does not help."""
+    def may_need_training(self) -> bool:
+        """Whether a policy of more training could be certified: every mean can have a bound."""
         bounds = [bound for bound, _ in self.verdict.bounds.values()]
         return all(map(math.isfinite, [self.fewest, *bounds]))
 

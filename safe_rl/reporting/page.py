@@ -160,10 +160,10 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
 
 
 def _name_among(place: Path, others: Collection[Path]) -> str:
-    """The end of a folder's path that no other folder has."""
-    ends = (Path(*place.parts[-length:]) for length in range(1, len(place.parts)))
-    alone = (end for end in ends if sum(other.match(str(end)) for other in {*others}) == 1)
-    return str(next(alone, place))
+    """The shortest end of a folder's path that is not the end of another folder's."""
+    ends = (place.parts[-length:] for length in range(1, len(place.parts)))
+    alone = (e for e in ends if not any(o.parts[-len(e) :] == e for o in others if o != place))
+    return str(Path(*next(alone, place.parts)))
 
 
 def _baselines(

@@ -278,7 +278,7 @@ def certify_finished(
     except KeyboardInterrupt:
         return end_by(SIGINT, later)
     say(str(result))
-    if result is not None and result.checkpoint is None and result.has_bounds:
+    if result is not None and result.checkpoint is None and result.may_need_training:
         say(f"To train on: {again} frames={2 * config.frames:_}")
 
 

@@ -31,12 +31,12 @@ def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
     # 120 can never suffice
     assert "at least 561 are needed" in str(replace(certificate, fewest=561))
     assert "No number of episodes" in str(replace(certificate, fewest=math.inf))
-    assert certificate.has_bounds
-    assert not replace(certificate, fewest=math.inf).has_bounds
+    assert certificate.may_need_training
+    assert not replace(certificate, fewest=math.inf).may_need_training
     above = replace(verdict, bounds={"mean_cost": (math.inf, 5.0)}, shortfalls={"mean_cost": 5})
     said = str(replace(certificate, verdict=above))
     assert "mean_cost has no bound: costs are NaN, or above those that the specs" in said
-    assert not replace(certificate, verdict=above).has_bounds
+    assert not replace(certificate, verdict=above).may_need_training
 
 
 def test_several_bounds_are_a_table_and_what_holds_by_construction_is_said():

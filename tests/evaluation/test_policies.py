@@ -224,7 +224,7 @@ def certified(run, deterministic):
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_what_is_certified_is_what_is_exported(run, tmp_path, capsys, deterministic):
     certified(run, deterministic)
-    file = tmp_path / "policy.onnx"
+    file = tmp_path / "new" / "folder" / "policy.onnx"
     zeros = {"observation": np.zeros((2, 60), np.float32)}
     session = exported(run, file)
     texts = session.get_modelmeta().custom_metadata_map
@@ -254,8 +254,8 @@ def test_what_cannot_be_exported_is_said_in_a_line(run, tmp_path, capsys):
     assert export([str(run)]) == 2
     assert export([str(run), str(tmp_path / "a.onx")]) == 1
     assert "FILE.onnx, or a FOLDER" in capsys.readouterr().err
-    assert export([str(run), str(tmp_path / "a.onnx"), "checkpoint=certified"]) == 1
-    assert not (tmp_path / "a.onnx").exists()
+    assert export([str(run), str(tmp_path / "b" / "a.onnx"), "checkpoint=certified"]) == 1
+    assert not (tmp_path / "b").exists()
     for folder in (run, tmp_path):  # whose files are not those of an exported policy
         assert export([str(run), str(folder)]) == 1
         assert f"error: {folder} has other files" in capsys.readouterr().err

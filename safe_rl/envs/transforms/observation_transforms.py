@@ -35,7 +35,8 @@ class SensorNoise(ConstraintTransform):
 
     Every draw depends only on its row's seed, the episode, the step and the column. Therefore
     resumed runs are identical, and rows are independent. Pictures of integers are not changed. In
-    TorchRL's own `TransformedEnv` the seed is drawn from torch's generator; `set_seed` keeps it.
+    TorchRL's own `TransformedEnv` the seeds are drawn once, at the first reset, from torch's
+    generator, and `env.set_seed` does not change them.
 
     Args:
         std: Standard deviation of the noise, in the units of the observation; or the lowest and
