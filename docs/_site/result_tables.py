@@ -15,7 +15,7 @@ from safe_rl.cli.report import suite
 from safe_rl.envs import SUITE
 from safe_rl.reporting.archive import read_archive
 from safe_rl.reporting.experiments import group_runs
-from safe_rl.reporting.slates import paper_table
+from safe_rl.reporting.scoring import paper_table
 from safe_rl.scores.benchmark import ALGORITHMS
 from safe_rl.scores.bounds import rounded_up
 

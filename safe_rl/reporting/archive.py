@@ -13,7 +13,6 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -62,8 +61,7 @@ class Run(folders.Run):
             Exception: Of any type, if notes are not as a run writes them.
         """
         given = {**self.settings, "cost_limits": self.settings.get("cost_limits") or {}}
-        wrong = unusable_keys(given)
-        wrong += [] if "frames" in given else ["frames"]
+        wrong = [*unusable_keys(given), *(["frames"] if "frames" not in given else [])]
         if wrong:
             raise ValueError(
                 f"config.yaml is not that of a run: it lacks a usable {', '.join(wrong)}"
@@ -77,8 +75,14 @@ class Run(folders.Run):
         steps = np.array([0.0, *self.table["steps"]])
         if not (np.isfinite(steps).all() and (np.diff(steps) > 0).all() and self.hours > 0):
             raise ValueError("progress.csv cannot be read (its steps or times do not grow)")
-        for name in ("repeating", "evaluation_records", "certificate_record", "code_text"):
-            getattr(self, name)
+        # of these, tables are made later
+        _ = self.repeating
+        for evaluation in self.notes.get("evaluations", ()):
+            read_evaluation(evaluation)
+        if "certificate" in self.notes:
+            read_certificate(self.notes["certificate"])
+        if "code" in self.notes:
+            read_code(self.notes["code"])
 
     @property
     def length(self) -> int:
@@ -99,21 +103,6 @@ class Run(folders.Run):
         is_continued = isinstance(self.notes.get("frames_before"), int)
         frames = self.settings["frames"] if is_continued else None
         return repeating(self.overrides, map(clean, self.notes.get("config_dirs", ())), frames)
-
-    @cached_property
-    def evaluation_records(self) -> list[dict[str, Any]]:
-        """Its evaluations, each as a record, see `read_evaluation`."""
-        return [read_evaluation(evaluation) for evaluation in self.notes.get("evaluations", ())]
-
-    @cached_property
-    def certificate_record(self) -> dict[str, Any] | None:
-        """Its certificate as a record, see `read_certificate`, or None."""
-        return read_certificate(self.notes["certificate"]) if "certificate" in self.notes else None
-
-    @cached_property
-    def code_text(self) -> str | None:
-        """The version and commit of its code, see `read_code`, or None."""
-        return read_code(self.notes["code"]) if "code" in self.notes else None
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:

@@ -21,7 +21,7 @@ from pydantic import PositiveInt
 from safe_rl.checks import CheckedOptions, option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
-from safe_rl.reporting import figures, scoring, slates
+from safe_rl.reporting import figures, run_tables, scoring
 from safe_rl.reporting.archive import Run, find_runs
 from safe_rl.reporting.curves import (
     comparable,
@@ -140,8 +140,8 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     groups = _by_environment([e for e in experiments if e.finished])
     finals = [scoring.final_table(group) for group in groups]
     curves = [*benchmark_figures(experiments, width), *_curves(experiments, styles, width)]
-    complete = slates.complete_slates(experiments, options.seeds)
-    normalised = [*starmap(slates.slate_table, complete), slates.paper_table(experiments)]
+    complete = scoring.complete_slates(experiments, options.seeds)
+    normalised = [*starmap(scoring.slate_table, complete), scoring.paper_table(experiments)]
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
     sections = [
@@ -149,9 +149,9 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
         Section("curves", "Learning curves", curves),
         Section("fronts", "Return against cost", _fronts(groups, finals, styles, width)),
         Section("normalised", "Normalised scores", normalised),
-        Section("certificates", "Certificates", [scoring.certificate_table(experiments)]),
-        Section("evaluations", "Evaluations", [scoring.evaluation_table(experiments)]),
-        Section("runs", "Runs", [scoring.run_table(experiments), left_out]),
+        Section("certificates", "Certificates", [run_tables.certificate_table(experiments)]),
+        Section("evaluations", "Evaluations", [run_tables.evaluation_table(experiments)]),
+        Section("runs", "Runs", [run_tables.run_table(experiments), left_out]),
     ]
     # tables without rows are left out
     shown = [(s, [b for b in s.blocks if not isinstance(b, Table) or b.records]) for s in sections]
@@ -307,7 +307,7 @@ def _facts(report: Report) -> dict[str, str]:
         "algorithms": str(len({run.algorithm for run in runs})),
         "experiments": str(len(report.experiments)),
         "environment steps": f"{sum(run.steps for run in runs):,}",
-        "training": scoring.duration(sum(run.hours for run in runs)),
+        "training": run_tables.duration(sum(run.hours for run in runs)),
     }
 
 

@@ -1,29 +1,35 @@
-"""Tables of final scores, of costs during learning, and of what the folders of runs hold."""
+"""Tables of final scores, and of normalised ones as in the paper's Tables 1 and 2."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from math import inf, nan
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
-from safe_rl.reporting.tables import Record, Table, clean, each_cost, interval, mark_best, spread
+from safe_rl.reporting.tables import Record, Table, each_cost, interval, mark_best, spread
 from safe_rl.runs.table import final_rows
 from safe_rl.scores import benchmark
-from safe_rl.scores.bounds import rounded_up
+from safe_rl.scores.benchmark import Normalised
+from safe_rl.scores.comparisons import interquartile_mean
+
+_STEPS = "{fewest_steps:,}| to {most_steps:,}"
+_SYMBOLS = dict(
+    zip(Normalised._fields, (r"$\bar J_r$", r"$\bar M_c$", r"$\bar \rho_c$"), strict=True)
+)
+_SCORES = {symbol: f"{{{name}:.3f}}" for name, symbol in _SYMBOLS.items()}
+_PAPER = {f"paper {symbol}": f"{{paper_{name}:.3f}}" for name, symbol in _SYMBOLS.items()}
 
 
 def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, Any]:
     """Final J_r, J_c and ρ_c of an experiment: mean and standard deviation over its seeds."""
     runs, lengths, limits = experiment.finished, experiment.lengths, experiment.limits
     excesses = {f"excess_{k}": float(np.mean([run.excess(k) for run in runs])) for k in limits}
-    # NaN if no episode has finished
-    worst = None if any(map(math.isnan, excesses.values())) else max(excesses.values(), default=0.0)
-    return {
+    is_known = not any(map(math.isnan, excesses.values()))  # NaN if no episode has finished
+    record: dict[str, Any] = {
         "environment": experiment.environment,
         "algorithm": experiment.algorithm,
         "seeds": len(runs),
@@ -34,9 +40,15 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
         **_over_seeds([run.figures(list(cost_keys)) | _critic_bias(run) for run in runs]),
         **{f"limit_{key}": limit for key, limit in limits.items()},
         **excesses,
-        "satisfies": None if worst is None else worst <= 0,
-        **_published(experiment),
+        "satisfies": all(excess <= 0 for excess in excesses.values()) if is_known else None,
     }
+    if experiment.is_published_problem:
+        name = experiment.benchmark or ""
+        if experiment.base == "ppo" and (paper := benchmark.REFERENCE.get(name)):
+            record |= {f"paper_{field}": value for field, value in paper._asdict().items()}
+        if later := benchmark.REIMPLEMENTATIONS.get(name, {}).get(experiment.base):
+            record |= zip(("later_return", "later_cost"), later, strict=True)
+    return record
 
 
 def _critic_bias(run: Run) -> dict[str, float]:
@@ -56,28 +68,18 @@ def _over_seeds(values: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return record
 
 
-def _published(experiment: Experiment) -> dict[str, Any]:
-    """Published values for the same problem and algorithm."""
-    if not experiment.is_published_problem:
-        return {}
-    paper = experiment.reference if experiment.base == "ppo" else None
-    later = benchmark.REIMPLEMENTATIONS.get(experiment.benchmark or "", {}).get(experiment.base)
-    fields = {f"paper_{name}": value for name, value in (paper._asdict() if paper else {}).items()}
-    return fields | dict(zip(("later_return", "later_cost"), later or (), strict=False))
-
-
 def final_table(experiments: Sequence[Experiment]) -> Table:
     """Final scores on one environment, with published values beside them."""
     environment, keys = experiments[0].environment, cost_keys_of(experiments)
     records = [final_record(experiment, keys) for experiment in experiments]
     fields = {"mean": "episode_{}", "mean_std": "episode_{}_std", "limit": "limit_{}"}
     fields |= {"rate": "{}_rate", "rate_std": "{}_rate_std", "excess": "excess_{}"}
-    rows = [dict(row) for row in each_cost(records, keys, **fields, bias="critic_bias_{}")]
+    rows = each_cost(records, keys, **fields, bias="critic_bias_{}")
     others = {e.algorithm: e.limits_of_other_measures for e in experiments}
     for row in rows:
         if row.get("key") in others[row["algorithm"]]:
             row["measure"] = row["limit"] + row["excess"]
-    has = {name for row in [*rows, *records] for name in row}
+    has = {name for row in rows for name in row}
     columns = {
         "algorithm": "{algorithm}",
         **({"cost": "{cost}"} if len(keys) > 1 else {}),
@@ -88,7 +90,7 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
         "$J_r$": spread("episode_return", 2),
         r"$\rho_c$": spread("rate", 4),
         "seeds": "{seeds:d}",
-        "steps": "{fewest_steps:,}| to {most_steps:,}",
+        "steps": _STEPS,
         **({"critics' bias": "{bias:+.1f}"} if "bias" in has else {}),
     }
     if "paper_episode_return" in has:
@@ -98,140 +100,164 @@ def final_table(experiments: Sequence[Experiment]) -> Table:
     if "later_return" in has:
         title = f"later work, {benchmark.REIMPLEMENTATION_STEPS / 1e6:g}M steps"
         columns[title] = "{later_return:g} / {later_cost:g}"
-    marks = _final_marks(records, {e.algorithm: (e.lengths, e.limits) for e in experiments})
-    return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
-
-
-def _final_marks(
-    records: Sequence[Record], rivals: Mapping[str, Any]
-) -> dict[str, Callable[[Record], str]]:
-    """Column -> marks of costs over their limits, and of the best scores that keep them.
-
-    Only experiments with equal ``rivals`` (lengths of training, limits) are compared.
-    """
 
     def over(row: Record) -> str:
         return "bad" if row.get("excess", 0.0) > 0 else ""
 
-    rates = mark_best(records, "cost_rate", min, lambda r: r["satisfies"], rivals)
-    return {
+    # only experiments with equally long training and equal limits are compared
+    rivals = {e.algorithm: (e.lengths, e.limits) for e in experiments}
+    best_rate = mark_best(records, "cost_rate", min, lambda r: r["satisfies"], rivals)
+    marks = {
         "$J_r$": mark_best(records, "episode_return", max, lambda r: r["satisfies"], rivals),
         # single costs are not ranked
-        r"$\rho_c$": lambda row: rates(row) if row.get("key") == "cost" else "",
+        r"$\rho_c$": lambda row: best_rate(row) if row.get("key") == "cost" else "",
         "$J_c$": lambda row: "" if "measure" in row else over(row),
         "limited measure": lambda row: over(row) if "measure" in row else "",
     }
+    return Table(f"final_{environment}", environment, columns, records, "", rows, marks)
 
 
-_WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
+def complete_slates(
+    experiments: Sequence[Experiment], needed: int
+) -> Iterator[tuple[str, list[list[Experiment]]]]:
+    """Slates that one algorithm or more has complete, and the environments that all share.
 
-
-def _each_run(experiments: Sequence[Experiment]) -> Iterator[tuple[dict[str, Any], Run]]:
-    for e in experiments:
-        place = {"environment": e.environment, "algorithm": e.algorithm}
-        yield from (({**place, "seed": run.seed}, run) for run in e.runs)
-
-
-def _names(records: Sequence[Record], start: str) -> list[str]:
-    """The names of all fields with a prefix, without it."""
-    fields = dict.fromkeys(name for record in records for name in record)
-    return [name.removeprefix(start) for name in fields if name.startswith(start)]
-
-
-def run_table(experiments: Sequence[Experiment]) -> Table:
-    """Every run with its final scores, its folder and the command that repeats it."""
-    records = [
-        {
-            **where,
-            "steps": run.steps,
-            "state": "finished" if run.steps >= frames else f"{run.steps / frames:.0%}",
-            "hours": run.hours,
-            "time": duration(run.hours),
-            **run.figures(["cost"]),
-            "folder": clean(run.directory),
-            "code": run.code_text,
-            "command": run.repeating or "not recorded",
-        }
-        for where, run in _each_run(experiments)
-        for frames in [run.settings["frames"]]
-    ]
-    columns = {
-        **_WHERE,
-        "steps": "{steps:,}",
-        "state": "{state}",
-        "time": "{time:}",
-        "steps/s": "{steps_per_second:,.0f}",
-        "$J_r$": "{episode_return:.2f}",
-        "$J_c$": "{episode_cost:.1f}",
-        r"$\rho_c$": "{cost_rate:.4f}",
-        **({"code": "{code}"} if any(r["code"] for r in records) else {}),
-        "command": "{command}",
-    }
-    return Table("runs", "Runs", columns, records)
-
-
-def duration(hours: float) -> str:
-    """A duration in minutes or hours.
-
-    Examples:
-        >>> duration(0.21), duration(2.5)
-        ('13 min', '2.5 h')
+    Yields the name of a slate, and for each algorithm with at least ``needed`` finished runs per
+    environment its experiments, one per environment, with a limit on ``cost``. Only plain
+    experiments count.
     """
-    return f"{60 * hours:.0f} min" if hours < 1 else f"{hours:,.1f} h"
+    by_algorithm: dict[str, dict[str, Experiment]] = {}
+    for e in experiments:
+        if e.benchmark in benchmark.REFERENCE and e.is_plain:
+            cell = by_algorithm.setdefault(e.algorithm, {})
+            if "cost" in e.limits and e.finished:
+                cell[str(e.benchmark)] = e
+    cells = by_algorithm.values()
+    shared = tuple(name for name in benchmark.REFERENCE if all(name in cell for cell in cells))
+    slates = {name: (slate, needed) for name, slate in benchmark.SLATES.items()}
+    shown = []
+    for name, (slate, least) in {**slates, "shared": (shared, 1)}.items():
+        members = [
+            [cell[env] for env in slate]
+            for cell in cells
+            if all(env in cell and len(cell[env].finished) >= least for env in slate)
+        ]
+        if slate and members and slate not in shown:
+            shown.append(slate)
+            yield name, members
 
 
-def evaluation_table(experiments: Sequence[Experiment]) -> Table:
-    """The results of ``safe-rl evaluate`` of all runs."""
-    runs = _each_run(experiments)
-    records = [{**where, **record} for where, run in runs for record in run.evaluation_records]
-    others = {(e.environment, e.algorithm): e.limits_of_other_measures for e in experiments}
-    total = ["cost"] if any("episode_cost" in record for record in records) else []
-    keys = list(dict.fromkeys([*total, *_names(records, "limit_")]))
-    columns = {
-        **_WHERE,
-        "checkpoint": "{checkpoint}",
-        "episodes": "{episodes:d}",
-        "what": "{manner}",
-        "$J_r$": interval("episode_return", 2),
-        **({"cost": "{cost}"} if len(keys) > 1 else {}),
-        "$J_c$": interval("mean", 1),
-        "$d$": "{limit:g}",
-        # with a decimal: a few of many episodes are not shown as 0 %
-        "P($C$ > $d$)": "{over:.1%}",
-        "CVaR": "{cvar_alpha:.1%}: " + interval("cvar", 1),
+def normalised_scores(experiments: Sequence[Experiment]) -> dict[str, list[np.ndarray]]:
+    """Normalised final scores of one algorithm: score -> values per environment, one of a run."""
+    strata: dict[str, list[np.ndarray]] = {name: [] for name in Normalised._fields}
+    for e in experiments:
+        finals = [run.figures(["cost"]) for run in e.finished]
+        returns, rates = ([f[name] for f in finals] for name in ("episode_return", "cost_rate"))
+        # J_c, or the other measure that the run compares with the limit
+        limit = e.limits["cost"]
+        measures = limit + np.array([run.excess("cost") for run in e.finished])
+        reference = benchmark.REFERENCE[str(e.benchmark)]
+        scores = benchmark.normalise(returns, measures, rates, limit=limit, reference=reference)
+        for name, values in zip(strata, scores, strict=True):
+            strata[name].append(values)
+    return strata
+
+
+def _slate_record(slate: str, experiments: Sequence[Experiment]) -> dict[str, Any]:
+    """Averages over environments of averages over seeds, and interquartile means of all runs."""
+    strata = normalised_scores(experiments)
+    steps = {steps for e in experiments for steps in e.lengths}
+    record: dict[str, Any] = {
+        "slate": slate,
+        "algorithm": experiments[0].algorithm,
+        "runs": sum(map(len, strata["violation"])),
+        "fewest_steps": min(steps),
+        "most_steps": max(steps) if len(steps) > 1 else None,
+        **{name: float(np.mean([runs.mean() for runs in s])) for name, s in strata.items()},
     }
-    fields = {"limit": "limit_{}", "over": "over_limit_{}"}
-    for end in ("", "_low", "_high"):
-        fields |= {f"mean{end}": f"episode_{{}}{end}", f"cvar{end}": f"cvar_{{}}{end}"}
-
-    def over(row: Record) -> str:
-        # a limit on another measure than the mean is not judged by these episodes' mean
-        is_mean_limited = row.get("key") not in others[row["environment"], row["algorithm"]]
-        return "bad" if is_mean_limited and row.get("mean", 0.0) > row.get("limit", inf) else ""
-
-    rows = each_cost(records, keys, **fields)
-    return Table("evaluations", "Evaluations", columns, records, shown=rows, marks={"$J_c$": over})
+    if record["runs"] > 1:
+        for name in strata:
+            names = (f"iqm_{name}", f"iqm_{name}_low", f"iqm_{name}_high")
+            record |= zip(names, interquartile_mean(strata[name]), strict=True)
+    paper = benchmark.PUBLISHED.get(slate, {}).get(experiments[0].base)
+    is_whole = len(experiments) == len(benchmark.SLATES.get(slate, ()))
+    if paper and is_whole and all(e.is_published_problem for e in experiments):
+        record |= {f"paper_{name}": value for name, value in paper._asdict().items()}
+    return record
 
 
-def certificate_table(experiments: Sequence[Experiment]) -> Table:
-    """The certificates of all runs that have one."""
-    runs = _each_run(experiments)
-    records = [{**where, **run.certificate_record} for where, run in runs if run.certificate_record]
-    columns = {
-        **_WHERE,
-        "certified": "{certified}| at {surely}",
-        "at": "{checkpoint:,} steps",
-        "$J_r$": "{certified_return:.2f}",
-        "bound on": "{cost}",
-        "is": "{bound:.4g}",
-        "limit": "{most:g}",
-        "episodes": "{episodes:d}",
-        "test": "{test}, {actions} actions",
+def _keeps(record: Record) -> bool:
+    """Whether an algorithm keeps the constraint on a slate."""
+    return bool(record["violation"] <= benchmark.NOISE_OF_ZERO)
+
+
+def slate_table(slate: str, members: Sequence[Sequence[Experiment]]) -> Table:
+    """A slate of `complete_slates` as in the paper's Tables 1 and 2, with published values."""
+    records = [_slate_record(slate, experiments) for experiments in members]
+    columns = {"algorithm": "{algorithm}", "runs": "{runs:d}", "steps": _STEPS, **_SCORES}
+    if any("iqm_violation" in record for record in records):
+        columns |= {f"IQM {s}": interval(f"iqm_{name}", 3) for name, s in _SYMBOLS.items()}
+    note = f"On {', '.join(str(e.benchmark) for e in members[0])}."
+    if slate in benchmark.PUBLISHED:
+        columns |= _PAPER
+        after = sorted({benchmark.PUBLISHED_STEPS[e] for e in benchmark.SLATES[slate]})
+        note += f" Paper: after {' (Doggo: '.join(f'{n:,}' for n in after)} steps"
+        note += ")." if len(after) > 1 else "."
+    # only algorithms for which these are equal are compared
+    rivals = {m[0].algorithm: [(e.lengths, e.limits["cost"]) for e in m] for m in members}
+    marks = {
+        _SYMBOLS["episode_return"]: mark_best(records, "episode_return", max, _keeps, rivals),
+        _SYMBOLS["violation"]: lambda r: "bad" if r["violation"] > benchmark.NOISE_OF_ZERO else "",
+        _SYMBOLS["cost_rate"]: mark_best(records, "cost_rate", min, _keeps, rivals),
     }
-    rows = each_cost(records, _names(records, "bound_"), bound="bound_{}", most="most_{}")
-    rows = [{**row, "bound": rounded_up(row.get("bound", nan), 4)} for row in rows]
-    marks = {"certified": lambda row: "bad" if row["certified"] == "no" else ""}
-    note = ""
-    if any(record["test"] == "Student" for record in records):
-        note = "Student: a bound that is too low if rare episodes cost far more than the others."
-    return Table("certificates", "Certificates", columns, records, note, rows, marks)
+    title = "What all algorithms were trained on" if slate == "shared" else slate
+    return Table(f"slate_{slate}", title, columns, records, note, marks=marks)
+
+
+def paper_table(experiments: Sequence[Experiment]) -> Table:
+    """The paper's Tables 1 and 2, as far as there are runs, with the published values beside ours.
+
+    A row is an algorithm of the paper on a slate: averages over those of its environments on which
+    it has finished runs. An algorithm dominates another one on the same environments after equally
+    many steps if both keep the constraint and it has no lower return and no higher cost rate, and
+    one of them is better.
+    """
+    ours = [
+        e
+        for e in experiments
+        if e.base in benchmark.ALGORITHMS
+        and e.is_published_problem
+        and e.benchmark in benchmark.REFERENCE
+        and e.finished
+    ]
+    records: list[dict[str, Any]] = []
+    for slate in ("SG18", "SG12", "SG6", "SG1", "SG2", "SGPoint", "SGCar", "SGDoggo"):
+        names, rows = benchmark.SLATES[slate], []
+        for algorithm in dict.fromkeys(e.algorithm for e in ours):
+            members = [e for e in ours if e.algorithm == algorithm and e.benchmark in names]
+            if members:
+                record, there = _slate_record(slate, members), {e.benchmark for e in members}
+                rows.append((record, (there, record["fewest_steps"], record["most_steps"])))
+        for record, trained in rows:
+            peers = [other for other, as_other in rows if as_other == trained and _keeps(other)]
+            better = [p["algorithm"] for p in peers if _keeps(record) and _dominates(p, record)]
+            counts = {"all": len(names), "environments": len(trained[0])}
+            records.append({**record, **counts, "dominated": ", ".join(better)})
+    columns = {
+        **{"slate": "{slate}", "algorithm": "{algorithm}"},
+        **{"environments": "{environments:d}| of {all:d}", "runs": "{runs:d}", "steps": _STEPS},
+        **_SCORES,
+        **_PAPER,
+        "dominated by": "{dominated}",
+    }
+    note = (
+        "Averages over the environments that there are; the paper's, over all of a slate after "
+        "10,000,000 steps (Doggo: 100,000,000), stand only beside complete rows."
+    )
+    return Table("paper", "The paper's Tables 1 and 2", columns, records, note)
+
+
+def _dominates(one: Record, other: Record) -> bool:
+    """Whether no score of one is worse than the other's, and one of them is better."""
+    ours, theirs = ((r["episode_return"], -r["cost_rate"]) for r in (one, other))
+    return ours != theirs and all(a >= b for a, b in zip(ours, theirs, strict=True))

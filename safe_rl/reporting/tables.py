@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from string import Formatter
 from typing import Any, NamedTuple
 
 from matplotlib.ticker import EngFormatter
@@ -60,19 +60,25 @@ def filled(template: str, record: Record) -> str:
         >>> filled("{x:.1f}| ± {x_std:.1f}", {"x": 1.25}), filled("{x:.1f}", {"y": 1})
         ('1.2', '—')
     """
-    texts = []
-    for part in template.split("|"):
-        names = [name for _, name, _, _ in Formatter().parse(part) if name]
-        texts.append(None if any(_is_missing(record.get(n)) for n in names) else part)
-    joined = "".join(text.format(**record) for text in texts if text is not None)
-    return "—" if texts[0] is None else joined
+    known = {name: value for name, value in record.items() if not _is_missing(value)}
+    first, *others = template.split("|")
+    try:
+        text = first.format_map(known)
+    except KeyError:
+        return "—"
+    for part in others:
+        with suppress(KeyError):
+            text += part.format_map(known)
+    return text
 
 
 def _is_missing(value: Any) -> bool:
     return value is None or (isinstance(value, float) and math.isnan(value))
 
 
-def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> list[Record]:
+def each_cost(
+    records: Sequence[dict[str, Any]], keys: Sequence[str], **fields: str
+) -> list[dict[str, Any]]:
     """A row for every cost of every record; a record without figures of costs is one row.
 
     ``fields``: field of a row -> field of the record, with braces in place of the cost's key.
@@ -81,9 +87,9 @@ def each_cost(records: Sequence[Record], keys: Sequence[str], **fields: str) -> 
         >>> each_cost([{"seed": 0, "rate_a": 1.0}], ["a", "b"], rate="rate_{}")
         [{'seed': 0, 'rate_a': 1.0, 'key': 'a', 'cost': 'a', 'rate': 1.0}]
     """
-    rows: list[Record] = []
+    rows = []
     for record in records:
-        of_record: list[Record] = []
+        of_record = []
         for key in keys:
             places = {name: place.format(key) for name, place in fields.items()}
             if figures := {name: record[p] for name, p in places.items() if p in record}:
@@ -176,10 +182,10 @@ def mark_best(
     def mark(record: Record) -> str:
         peers = rivals[record["algorithm"]]
         group = [other for other in records if rivals[other["algorithm"]] == peers]
-        if len(group) < 2 or name not in record or not is_able(record):
-            return ""
         known = [r[name] for r in group if is_able(r) and not _is_missing(r.get(name))]
-        return "best" if known and math.isclose(record[name], best(known), rel_tol=1e-9) else ""
+        if len(group) < 2 or not is_able(record) or not known:
+            return ""
+        return "best" if math.isclose(record.get(name, math.nan), best(known)) else ""
 
     return mark
 

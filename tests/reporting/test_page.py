@@ -13,8 +13,8 @@ from synthetic import experiments_in, marks, texts_of, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting.archive import read_archive
-from safe_rl.reporting.scoring import evaluation_table
-from safe_rl.reporting.slates import complete_slates, slate_table
+from safe_rl.reporting.run_tables import evaluation_table
+from safe_rl.reporting.scoring import complete_slates, slate_table
 from safe_rl.runs.run import Run
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}

@@ -5,8 +5,14 @@ import pytest
 from synthetic import SUITE, experiments_in, marks, texts_of, write_run
 
 from safe_rl.reporting.page import Drawing, ReportOptions, build_report
-from safe_rl.reporting.scoring import final_record, final_table
-from safe_rl.reporting.slates import complete_slates, normalised_scores, paper_table, slate_table
+from safe_rl.reporting.scoring import (
+    complete_slates,
+    final_record,
+    final_table,
+    normalised_scores,
+    paper_table,
+    slate_table,
+)
 from safe_rl.reporting.tables import Table
 from safe_rl.scores.benchmark import PUBLISHED_STEPS, REFERENCE, SLATES
 
