@@ -8,9 +8,9 @@ from PIL import Image
 
 from safe_rl.cli.report import suite
 from safe_rl.reporting.archive import find_runs
+from safe_rl.reporting.curves import benchmark_figures
 from safe_rl.reporting.experiments import group_runs
 from safe_rl.reporting.figures import WIDTH
-from safe_rl.reporting.page import benchmark_figures
 from safe_rl.runs.curves import save_figure
 
 ROOT = Path(__file__).resolve().parents[2]

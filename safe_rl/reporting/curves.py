@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, groupby
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from safe_rl.reporting.archive import Run
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.figures import (
     LIMIT_STYLE,
-    WIDTH,
+    Drawing,
     Style,
     add_legend,
     algorithm_styles,
@@ -27,12 +28,15 @@ from safe_rl.reporting.figures import (
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.curves import moving_mean
 from safe_rl.runs.table import final_width
-from safe_rl.scores.benchmark import ALGORITHMS
+from safe_rl.scores.benchmark import ALGORITHMS, SLATES
 from safe_rl.scores.comparisons import t_interval
 
 _NUM_POINTS = 200  # of a curve at most; a panel is not much wider in pixels
 _NUM_MARKERS = 6  # of a curve
 _ROW_HEIGHT = 2.4  # of a row of panels [inch]
+_MOST_ROWS = 6  # of a picture of learning curves, so that it fits on a printed page
+_MOST_CURVES = 6  # in one panel
+_FEWEST_ENVIRONMENTS = 3  # of the benchmark, with which its figures are drawn
 _TITLES = ("Return", "Episode cost", "Cost rate")
 
 
@@ -71,30 +75,85 @@ def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None
     return Average(grid, heights.mean(-1), *t_interval(heights))
 
 
-def draw_learning_curves(
-    experiments: Sequence[Experiment], styles: Mapping[str, Style], width: float = WIDTH
+def _curves(runs: Sequence[Run], key: str) -> list[Average | None]:
+    """Return, episode cost and cost rate; None in place of those without a value."""
+    columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
+    return [average(runs, name, smooth=s) for name, s in columns]
+
+
+def _drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
+    """Cost keys with a limit, or the aggregate cost if there are none."""
+    limited = {key for experiment in experiments for key in experiment.limits}
+    return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
+
+
+def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
+    """All curves of the pictures as a long table: a row for every point of every quantity."""
+    return [
+        {
+            **{"environment": e.environment, "algorithm": e.algorithm, "cost": key},
+            **{"quantity": name, "seeds": len(runs)},
+            **dict(zip(Average._fields, map(float, point), strict=True)),
+        }
+        for e in experiments
+        for runs in [e.finished or e.runs]
+        for key in _drawn_keys([e])
+        for name, curve in zip(("return", "cost", "rate"), _curves(runs, key), strict=True)
+        if curve is not None
+        for point in zip(*curve, strict=True)
+    ]
+
+
+def learning_curves(
+    experiments: Sequence[Experiment], styles: Mapping[str, Style], width: float
+) -> list[Drawing]:
+    """Draw return, episode cost and cost rate over steps, a row per environment and steps of runs.
+
+    More than a few curves of a row are shared out among pictures of their own.
+    """
+    rows, pictures = [], []
+    for _, group in groupby(experiments, key=lambda e: e.environment):
+        by_steps = sorted(group, key=lambda e: e.planned_steps)
+        for _, of_steps in groupby(by_steps, key=lambda e: e.planned_steps):
+            row = [*of_steps]
+            if len(row) <= _MOST_CURVES:
+                rows.append(row)
+            else:
+                pictures += [[part] for part in _parts(row, _MOST_CURVES)]
+    drawings = []
+    for picture in [*pictures, *_parts(rows, _MOST_ROWS)]:
+        names = ", ".join(dict.fromkeys(e.environment for e in chain(*picture)))
+        algorithms = ", ".join(dict.fromkeys(e.label for e in chain(*picture)))
+        says = f"Return, episode cost and cost rate over environment steps: {names}; {algorithms}"
+        drawings.append(Drawing("curves", "", _draw_rows(picture, styles, width), says))
+    return drawings
+
+
+def _parts(items: list[Any], most: int) -> list[list[Any]]:
+    return [items[start : start + most] for start in range(0, len(items), most)]
+
+
+def _draw_rows(
+    rows: Sequence[Sequence[Experiment]], styles: Mapping[str, Style], width: float
 ) -> Figure:
-    """Draw return, episode cost and cost rate over steps, a row per environment.
+    """Draw a picture of learning curves, with a row of panels for each cost with a limit.
 
     Lines are means over seeds, bands their 95 % t intervals. Return and episode cost are moving
     means over as many epochs as final figures. Limits d are dashed, and so is d / T_ep in the panel
-    of the cost rate. Each unfinished run is a dotted line of its own. An environment has a row for
-    each number of steps and each cost with a limit.
+    of the cost rate. Each unfinished run is a dotted line of its own.
     """
-    groups: dict[tuple[str, int], list[Experiment]] = {}
-    for e in experiments:
-        groups.setdefault((e.environment, e.planned_steps), []).append(e)
-    rows = [(*group, key) for group, members in groups.items() for key in drawn_keys(members)]
-    figure = Figure(figsize=(width, _ROW_HEIGHT * len(rows) + 0.3), layout="constrained")
-    panels = figure.subplots(len(rows), 3, squeeze=False, sharex="row")
-    several = len({name for name, _ in groups}) < len(groups)
-    for (environment, steps, key), axes in zip(rows, panels, strict=True):
-        _draw_panels(groups[environment, steps], key, axes, styles)
-        words = [fill(environment.replace(" (", "\n("), 24, replace_whitespace=False)]
-        words += [f"{short_number(steps)} steps"] if several else []
+    lines = [(members, key) for members in rows for key in _drawn_keys(members)]
+    figure = Figure(figsize=(width, _ROW_HEIGHT * len(lines) + 0.3), layout="constrained")
+    panels = figure.subplots(len(lines), 3, squeeze=False, sharex="row")
+    has_several_steps = len({members[0].environment for members in rows}) < len(rows)
+    for (members, key), axes in zip(lines, panels, strict=True):
+        _draw_panels(members, key, axes, styles)
+        environment = members[0].environment.replace(" (", "\n(")
+        words = [fill(environment, 24, replace_whitespace=False)]
+        words += [f"{short_number(members[0].planned_steps)} steps"] if has_several_steps else []
         words += [] if key == "cost" else [clean(key, 40)]
         axes[0].set_ylabel(literal("\n".join(words)), fontweight="bold")
-        set_axes(axes)
+        _set_axes(axes, ticks=6)
     for axis, title in zip(panels[0], _TITLES, strict=True):
         axis.set_title(title, fontweight="bold")
     for axis in panels[-1]:
@@ -103,7 +162,30 @@ def draw_learning_curves(
     return figure
 
 
-def comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -> list[Experiment]:
+def benchmark_figures(experiments: Sequence[Experiment], width: float) -> list[Drawing]:
+    """The paper's Figures 7 to 9, of robots with runs; none if there are runs on few environments.
+
+    Environments without runs are shown as missing.
+    """
+    robots = {"Point": 7, "Car": 8, "Doggo": 9}
+    by_robot = {robot: _comparable(experiments, SLATES[f"SG{robot}"]) for robot in robots}
+    if len({e.benchmark for members in by_robot.values() for e in members}) < _FEWEST_ENVIRONMENTS:
+        return []
+    return [
+        Drawing(
+            f"figure_{robots[robot]}",
+            f"The paper's Figure {robots[robot]}, from runs of "
+            f"{short_number(members[0].planned_steps)} steps",
+            _draw_columns(members, SLATES[f"SG{robot}"], width),
+            "Return, episode cost and cost rate of the paper's algorithms, a column for each of "
+            f"{robot}'s environments",
+        )
+        for robot, members in by_robot.items()
+        if members
+    ]
+
+
+def _comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -> list[Experiment]:
     """The paper's algorithms on some environments: one experiment each, with equally many steps.
 
     These are the steps that most of the experiments have. Of several experiments that differ in
@@ -123,13 +205,12 @@ def comparable(experiments: Sequence[Experiment], environments: Sequence[str]) -
     return [*{(e.benchmark, e.base): e for e in by_seeds}.values()]
 
 
-def draw_benchmark(
-    experiments: Sequence[Experiment], environments: Sequence[str], width: float = WIDTH
+def _draw_columns(
+    experiments: Sequence[Experiment], environments: Sequence[str], width: float
 ) -> Figure:
     """Draw return, episode cost and cost rate below one another, a column per environment.
 
-    With the experiments of `comparable` on a robot's environments, this is the paper's Figure 7, 8
-    or 9. Below the name of an environment stands how many of the algorithms there are.
+    Below the name of an environment stands how many of the algorithms there are.
     """
     figure = Figure(figsize=(width, 0.55 * width), layout="constrained")
     panels = figure.subplots(3, len(environments), sharex=True)
@@ -146,7 +227,7 @@ def draw_benchmark(
             axis.text(0.5, 0.5, "no runs", transform=axis.transAxes, ha="center", color="0.5")
             axis.set_yticks([])
     for axes in panels.T:  # which share their steps: when all are drawn
-        set_axes(axes, ticks=3)
+        _set_axes(axes, ticks=3)
     for axis, title in zip(panels[:, 0], _TITLES, strict=True):
         axis.set_ylabel(title, fontweight="bold")
     add_legend(figure, panels.ravel())
@@ -162,41 +243,22 @@ def _coverage(experiments: Sequence[Experiment]) -> str:
     return algorithms + (f", {several} {unit}" if seeds else "")
 
 
-def drawn_keys(experiments: Sequence[Experiment]) -> list[str]:
-    """Cost keys with a limit, or the aggregate cost if there are none."""
-    limited = {key for experiment in experiments for key in experiment.limits}
-    return [key for key in cost_keys_of(experiments) if key in limited] or ["cost"]
-
-
-def _curves(runs: Sequence[Run], key: str) -> list[Average | None]:
-    """Return, episode cost and cost rate; None in place of those without a value."""
-    columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
-    return [average(runs, name, smooth=s) for name, s in columns]
-
-
-def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
-    """All curves of the pictures as a long table: a row for every point of every quantity."""
-    return [
-        {
-            **{"environment": e.environment, "algorithm": e.algorithm, "cost": key},
-            **{"quantity": name, "seeds": len(runs)},
-            **dict(zip(Average._fields, map(float, point), strict=True)),
-        }
-        for e in experiments
-        for runs in [e.finished or e.runs]
-        for key in drawn_keys([e])
-        for name, curve in zip(("return", "cost", "rate"), _curves(runs, key), strict=True)
-        if curve is not None
-        for point in zip(*curve, strict=True)
-    ]
-
-
 def _draw_panels(
     experiments: Sequence[Experiment], key: str, axes: Sequence[Axes], styles: Mapping[str, Style]
 ) -> None:
-    """Draw return, episode cost and cost rate into a panel each, with the limits d and d / T_ep."""
-    for experiment in experiments:
-        _draw_experiment(experiment, key, axes, styles[experiment.label])
+    """Draw return, episode cost and cost rate into a panel each, with the limits d and d / T_ep.
+
+    Finished runs are a mean and its interval, each unfinished run is a line.
+    """
+    for e in experiments:
+        name = literal(e.label)
+        looks = [(e.finished, {"label": name, "linestyle": styles[e.label].line, "linewidth": 1.5})]
+        dotted = {"label": f"{name} (unfinished)", "linestyle": ":", "linewidth": 1.2}
+        looks += [((run,), dotted) for run in e.runs if not run.is_finished]
+        for runs, look in looks:
+            for axis, curve in zip(axes, _curves(runs, key), strict=True):
+                if curve is not None:
+                    _draw_curve(axis, curve, styles[e.label], look)
     limits = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
     for limit, length in limits:
         axes[1].axhline(limit, **LIMIT_STYLE)
@@ -204,28 +266,16 @@ def _draw_panels(
             axes[2].axhline(limit / length, **LIMIT_STYLE)
 
 
-def _draw_experiment(experiment: Experiment, key: str, axes: Sequence[Axes], style: Style) -> None:
-    """Draw finished runs as a mean and its interval, each unfinished run as a line."""
-    name = literal(experiment.label)
-    looks: list[tuple[Any, ...]] = [(experiment.finished, name, style.line, 1.5)]
-    unfinished = [[run] for run in experiment.runs if not run.is_finished]
-    looks += [(runs, f"{name} (unfinished)", ":", 1.2) for runs in unfinished]
-    for runs, label, line, width in looks:
-        for axis, curve in zip(axes, _curves(runs, key), strict=True):
-            if curve is None:
-                continue
-            every = max(1, len(curve.steps) // _NUM_MARKERS)
-            axis.plot(
-                curve.steps, curve.mean, **style.point, linestyle=line, linewidth=width,
-                label=label, markevery=every, markersize=4,
-            )  # fmt: skip
-            if len(runs) > 1:
-                look: dict[str, Any] = {"color": style.colour, "alpha": 0.2, "linewidth": 0}
-                axis.fill_between(curve.steps, curve.low, curve.high, **look)
+def _draw_curve(axis: Axes, curve: Average, style: Style, look: dict[str, Any]) -> None:
+    every = max(1, len(curve.steps) // _NUM_MARKERS)
+    axis.plot(curve.steps, curve.mean, **style.point, **look, markevery=every, markersize=4)
+    if np.isfinite(curve.low).all():  # several seeds
+        band: dict[str, Any] = {"color": style.colour, "alpha": 0.2, "linewidth": 0}
+        axis.fill_between(curve.steps, curve.low, curve.high, **band)
 
 
-def set_axes(axes: Sequence[Axes], ticks: int = 6) -> None:
-    """Set scales, ticks and grid of a row of panels: return, episode cost and cost rate."""
+def _set_axes(axes: Sequence[Axes], ticks: int) -> None:
+    """Set scales, ticks and grid of panels of return, episode cost and cost rate."""
     for axis in axes:
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.xaxis.set_major_locator(MaxNLocator(ticks))

@@ -37,6 +37,15 @@ WIDTH = 12.0
 _LEGEND, _LONGEST_LABEL = 140, 60  # widths of a legend and of a line in it [letters]
 
 
+class Drawing(NamedTuple):
+    """A picture: stem of its file, heading, figure, and alternative text."""
+
+    name: str
+    title: str
+    figure: Figure
+    shows: str
+
+
 class Style(NamedTuple):
     """How an experiment is drawn; experiments with one algorithm share colour and marker."""
 
@@ -103,43 +112,39 @@ Final = tuple[Experiment, Record]
 """An experiment, and the record of its final scores."""
 
 
-def compared(finals: Iterable[Final]) -> dict[str, list[Final]]:
-    """Experiments that can be compared, by the title of their panel.
-
-    These are at least two with a return and a cost, on one environment after equally many steps.
-    """
-    groups: dict[tuple[str, ...], list[Final]] = defaultdict(list)
-    for experiment, record in finals:
-        if math.isfinite(record["episode_return"] + record.get("episode_cost", math.nan)):
-            steps = dict.fromkeys((record["fewest_steps"], record["steps"]))
-            key = (experiment.environment, " to ".join(map(short_number, steps)))
-            groups[key].append((experiment, record))
-    return {f"{e}, {n} steps": members for (e, n), members in groups.items() if len(members) > 1}
-
-
-def draw_fronts(
-    groups: Mapping[str, Sequence[Final]], styles: Mapping[str, Style], width: float = WIDTH
-) -> Figure:
-    """Draw final returns against final costs, a panel per group of `compared`.
+def fronts(finals: Iterable[Final], styles: Mapping[str, Style], width: float) -> list[Drawing]:
+    """Draw final returns against final costs, a panel per environment and number of steps.
 
     A point is an experiment, with the standard deviations over its seeds. A line in an algorithm's
     colour joins its experiments under several limits; the limits are written beside the points.
-    The grey line is the Pareto front.
+    The grey line is the Pareto front. A single experiment has no panel, and one without a return or
+    a cost no point.
     """
-    columns = min(max(1, round(3 * width / WIDTH)), len(groups))
-    rows = -(-len(groups) // columns)
+    groups: dict[str, list[Final]] = defaultdict(list)
+    for experiment, record in finals:
+        if math.isfinite(record["episode_return"] + record.get("episode_cost", math.nan)):
+            steps = dict.fromkeys((record["fewest_steps"], record["steps"]))
+            lengths = " to ".join(map(short_number, steps))
+            groups[f"{experiment.environment}, {lengths} steps"].append((experiment, record))
+    shown = {title: members for title, members in groups.items() if len(members) > 1}
+    if not shown:
+        return []
+    columns = min(max(1, round(3 * width / WIDTH)), len(shown))
+    rows = -(-len(shown) // columns)
     figure = Figure(figsize=(width, 3.3 * rows + 0.2), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for number, (axis, (title, finals)) in enumerate(zip(panels, groups.items(), strict=False)):
-        _draw_front(axis, finals, styles)
+    for number, (axis, (title, members)) in enumerate(zip(panels, shown.items(), strict=False)):
+        _draw_front(axis, members, styles)
         axis.set_title(literal(fill(title, 44)), fontsize=10, fontweight="bold")
         axis.set_xlabel("episode cost")
         axis.set_ylabel("return" if number % columns == 0 else "")
         set_grid(axis)
-    for axis in panels[len(groups) :]:
+    for axis in panels[len(shown) :]:
         axis.set_axis_off()
     add_legend(figure, panels)
-    return figure
+    texts = [f"{title}: {', '.join(e.algorithm for e, _ in m)}" for title, m in shown.items()]
+    says = f"Final return against final episode cost. {'; '.join(texts)}"
+    return [Drawing("fronts", "", figure, says)]
 
 
 def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]) -> None:

@@ -6,15 +6,18 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
-from safe_rl.files import CONF
-from safe_rl.reporting.curves import draw_learning_curves
+from safe_rl.reporting.curves import benchmark_figures, learning_curves
 from safe_rl.reporting.experiments import PACKAGED
-from safe_rl.reporting.figures import add_legend, algorithm_styles, compared, draw_fronts
-from safe_rl.reporting.page import benchmark_figures
+from safe_rl.reporting.figures import add_legend, algorithm_styles, fronts
 from safe_rl.reporting.scoring import final_table
 from safe_rl.runs.curves import save_figure
 
 ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
+
+
+def learning_pictures(experiments):
+    drawings = learning_curves(experiments, algorithm_styles(experiments), 12.0)
+    return [drawing.figure for drawing in drawings]
 
 
 def test_panels_have_means_intervals_and_limits(tmp_path):
@@ -25,7 +28,7 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
               env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
     write_run(tmp_path, "PointPush1", "trpo", returns=[np.nan], costs=[np.nan], rates=[3])
     experiments = experiments_in(tmp_path)
-    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    (figure,) = learning_pictures(experiments)
     panels = np.array(figure.axes).reshape(3, 3)
     assert [axes.get_title() for axes in panels[0]] == ["Return", "Episode cost", "Cost rate"]
     assert panels[0, 0].get_ylabel() == "PointGoal1"
@@ -71,7 +74,7 @@ def test_every_limited_cost_has_a_row(tmp_path):
     hazards = {"episode_cost_hazards": (4,), "cost_hazards_rate": (0.004,)}
     write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0}, columns=hazards)
     experiments = experiments_in(tmp_path)
-    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
+    (figure,) = learning_pictures(experiments)
     panels = np.array(figure.axes).reshape(2, 3)
     assert [axes.get_ylabel() for axes in panels[:, 0]] == [
         "PointGoal1", "PointGoal1\ncost_hazards",
@@ -79,27 +82,23 @@ def test_every_limited_cost_has_a_row(tmp_path):
     assert [list(line.get_ydata()) for line in panels[1, 1].lines] == [[4.0], [5.0, 5.0]]
 
 
-def test_an_algorithm_has_one_colour_and_one_marker_everywhere(tmp_path):
-    for algo in ("ppo", "cpo", "mine", "yours"):
+def test_an_algorithm_has_one_look_everywhere_that_no_other_one_has(tmp_path):
+    others = ("mine", "yours", "theirs")
+    for algo in (*others, *PACKAGED):
         write_run(tmp_path, algo=algo)
     write_run(tmp_path, algo="cpo", frames=500, folder="variant")
     write_run(tmp_path, "CarGoal1", "cpo", limits={"cost": 9.0})
     everything = experiments_in(tmp_path)
     styles = algorithm_styles(everything)
-    looks = {
-        e.base: {styles[o.label][:2] for o in everything if o.base == e.base} for e in everything
-    }
-    assert all(len(own) == 1 for own in looks.values())
-    assert len(set.union(*looks.values())) == 4
+    looks = {(e.base, *styles[e.label][:2]) for e in everything}
+    assert len(looks) == len(PACKAGED) + 3
+    assert len({look[1:] for look in looks}) == len(looks)
     assert algorithm_styles([e for e in everything if e.base == "ppo"])["PPO"] == styles["PPO"]
-
-
-def test_the_algorithms_of_the_package_are_told_apart(tmp_path):
-    names = [path.stem for path in (CONF / "algo").glob("*.yaml")]
-    for name in names:
-        write_run(tmp_path, algo=name)
-    styles = algorithm_styles(experiments_in(tmp_path)).values()
-    assert len({style[:2] for style in styles}) == len({s.colour for s in styles}) == len(names)
+    # those of other algorithms are far from the package's
+    colours = {base: np.array(to_rgb(colour)) for base, colour, _ in looks}
+    for name in others:
+        for ours in PACKAGED:
+            assert np.linalg.norm(colours[name] - colours[ours]) > 0.35, (name, ours)
 
 
 def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
@@ -108,10 +107,12 @@ def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
         write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
         write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
     experiments = experiments_in(tmp_path)
-    figure = draw_learning_curves(experiments, algorithm_styles(experiments))
-    lines = figure.axes[0].lines
-    assert len({(line.get_color(), str(line._unscaled_dash_pattern)) for line in lines[::2]}) == 15
-    assert {line.get_linestyle() for line in lines[1::2]} == {":"}
+    styles = algorithm_styles(experiments).values()
+    assert len({(style.colour, str(style.line)) for style in styles}) == 15
+    # six in a picture, and unfinished runs are dotted
+    lines = [figure.axes[0].lines for figure in learning_pictures(experiments)]
+    assert [len(of_picture) for of_picture in lines] == [12, 12, 6]
+    assert {line.get_linestyle() for line in lines[0][1::2]} == {":"}
 
 
 @pytest.mark.parametrize(
@@ -137,9 +138,10 @@ def test_the_legend_is_as_wide_as_the_figure_at_most(names, tmp_path):
     assert panels[0].get_window_extent().height > 180
 
 
-def fronts(experiments):
+def front_panels(experiments):
     finals = zip(experiments, final_table(experiments).records, strict=True)
-    return draw_fronts(compared(finals), algorithm_styles(experiments))
+    (drawing,) = fronts(finals, algorithm_styles(experiments), 12.0)
+    return drawing.figure.axes
 
 
 def test_the_front_joins_what_no_other_one_beats(tmp_path):
@@ -147,7 +149,7 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
         write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
     write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
     experiments = experiments_in(tmp_path)
-    (axis,) = fronts(experiments).axes
+    (axis,) = front_panels(experiments)
     front = next(line for line in axis.lines if line.get_color() == "0.7")
     assert list(zip(*front.get_data(), strict=True)) == [(8.0, 3.0), (20.0, 10.0), (60.0, 20.0)]
     limits = sorted(line.get_xdata()[0] for line in axis.lines if line.get_linestyle() == "--")
@@ -167,19 +169,8 @@ def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
         rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
         write_run(tmp_path, algo=algo, **rows, limits={} if algo == "ppo" else None)
     experiments = experiments_in(tmp_path)
-    figure = fronts(experiments)
-    shown = {axis.get_title(): axis for axis in figure.axes if axis.get_title()}
+    shown = {axis.get_title(): axis for axis in front_panels(experiments) if axis.get_title()}
     assert list(shown) == ["PointGoal1, 1k steps", "PointGoal1, 3k steps"]
     assert len(shown["PointGoal1, 1k steps"].containers) == 2
     labels = shown["PointGoal1, 1k steps"].get_legend_handles_labels()[1]
     assert labels == ["PPO", "CPO"]
-
-
-def test_other_algorithms_have_colours_far_from_the_packages(tmp_path):
-    for algo in ("mine", "yours", "theirs", *sorted(PACKAGED)):
-        write_run(tmp_path, algo=algo)
-    experiments = experiments_in(tmp_path)
-    colours = {e.base: algorithm_styles(experiments)[e.label].colour for e in experiments}
-    ours = np.array([to_rgb(colours[name]) for name in PACKAGED])
-    for name in ("mine", "yours", "theirs"):
-        assert np.linalg.norm(ours - to_rgb(colours[name]), axis=1).min() > 0.35, name

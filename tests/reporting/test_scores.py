@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import SUITE, experiments_in, marks, texts_of, write_run
 
-from safe_rl.reporting.page import Drawing, ReportOptions, build_report
+from safe_rl.reporting.page import ReportOptions, build_report
 from safe_rl.reporting.scoring import (
     complete_slates,
     final_record,
@@ -13,7 +13,6 @@ from safe_rl.reporting.scoring import (
     paper_table,
     slate_table,
 )
-from safe_rl.reporting.tables import Table
 from safe_rl.scores.benchmark import PUBLISHED_STEPS, REFERENCE, SLATES
 
 
@@ -96,18 +95,17 @@ def test_seeds_that_have_not_come_equally_far_are_not_ranked_with_those_that_hav
         for algo in ("trpo_lagrangian", "ppo_lagrangian"):
             write_run(tmp_path, algo=algo, seed=seed, **long)
     report = build_report(tmp_path, SUITE, ReportOptions(seeds=2, unfinished=True))
-    tables = {b.name: b for s in report.sections for b in s.blocks if isinstance(b, Table)}
-    drawn = {b.name: b.shows for s in report.sections for b in s.blocks if isinstance(b, Drawing)}
-    final = tables["final_PointGoal1"]
+    blocks = {block.name: block for part in report.sections.values() for block in part}
+    final = blocks["final_PointGoal1"]
     steps = [row["steps"] for row in texts_of(final)]
     assert steps == ["10,000", "10,000", "1,000 to 10,000"]
     assert marks(final, "$J_r$") == ["best", "best", ""]
-    assert drawn["fronts"].endswith("PointGoal1, 10k steps: PPO-Lagrangian, TRPO-Lagrangian")
-    slate = tables["slate_shared"]
+    assert blocks["fronts"].shows.endswith("PointGoal1, 10k steps: PPO-Lagrangian, TRPO-Lagrangian")
+    slate = blocks["slate_shared"]
     assert [row[2].text for row in slate.rows()] == ["10,000", "10,000", "1,000 to 10,000"]
     assert marks(slate, r"$\bar J_r$") == ["best", "best", ""]
     # and it is not said to be finished
-    states = {(r["algorithm"], r["seed"]): r["state"] for r in tables["runs"].records}
+    states = {(r["algorithm"], r["seed"]): r["state"] for r in blocks["runs"].records}
     assert states["CPO", 10] == "10%"
     assert list(states.values()).count("finished") == 5
 
@@ -218,7 +216,7 @@ def test_what_counts_towards_no_slate(changes, tmp_path):
     for env in SLATES["SG6"]:
         write_run(tmp_path, env, "cpo", **changes)
     result = build_report(tmp_path, SUITE, ReportOptions(seeds=1))
-    assert "normalised" not in [section.name for section in result.sections]
+    assert "normalised" not in result.sections
 
 
 def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_path):
