@@ -13,6 +13,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,20 +39,15 @@ class Run(folders.Run):
         source: Name of the baselines that it belongs to; "" for a run of the report itself.
     """
 
+    notes: Mapping[str, Any]
     takes_part: bool = False
     source: str = ""
 
-    def __init__(
-        self,
-        directory: Path,
-        settings: Mapping[str, Any],
-        table: Mapping[str, list[float]],
-        notes: Mapping[str, Any],
-    ) -> None:
-        super().__init__(directory, settings=settings, table=table)
-        self.notes = notes
-        overrides = notes.get("overrides")
-        self.overrides = list(map(clean, overrides)) if isinstance(overrides, list) else None
+    @cached_property
+    def overrides(self) -> list[str] | None:
+        """Overrides of its command line, or None if they are not recorded."""
+        given = self.notes.get("overrides")
+        return list(map(clean, given)) if isinstance(given, list) else None
 
     def check(self) -> None:
         """Refuse a run that lacks what a report needs.
@@ -183,7 +179,7 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
         or None,
     }
     kept = {name: value for name, value in notes.items() if value is not None}
-    return Run(folder.directory, settings, table, kept)
+    return Run(folder.directory, settings=settings, table=table, notes=kept)
 
 
 def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
@@ -243,10 +239,11 @@ def read_archive(folder: Path | str) -> dict[str, Run]:
     try:
         entries = json.loads(read_bounded(folder / RUNS, _MOST_BYTES, packed=True))
         tables = dict(_tables(folder / ROWS))
-        return {
-            name: Run(folder / name, notes.pop("config"), tables.get(name, {}), notes)
-            for name, notes in entries.items()
-        }
+        runs = {}
+        for name, notes in entries.items():
+            contents = {"settings": notes.pop("config"), "table": tables.get(name, {})}
+            runs[name] = Run(folder / name, **contents, notes=notes)
+        return runs
     except Exception as error:  # the files may hold anything
         raise ValueError(f"{folder.name} is no archive ({error})") from error
 

@@ -251,27 +251,24 @@ def _draw_panels(
     Finished runs are a mean and its interval, each unfinished run is a line.
     """
     for e in experiments:
-        name = literal(e.label)
-        looks = [(e.finished, {"label": name, "linestyle": styles[e.label].line, "linewidth": 1.5})]
-        dotted = {"label": f"{name} (unfinished)", "linestyle": ":", "linewidth": 1.2}
-        looks += [((run,), dotted) for run in e.runs if not run.is_finished]
+        name, style = literal(e.label), styles[e.label]
+        looks = [(e.finished, {**style, "linewidth": 1.5, "label": name})]
+        dotted = {"linestyle": ":", "linewidth": 1.2, "label": f"{name} (unfinished)"}
+        looks += [((run,), {**style, **dotted}) for run in e.runs if not run.is_finished]
         for runs, look in looks:
             for axis, curve in zip(axes, _curves(runs, key), strict=True):
-                if curve is not None:
-                    _draw_curve(axis, curve, styles[e.label], look)
+                if curve is None:
+                    continue
+                every = max(1, len(curve.steps) // _NUM_MARKERS)
+                axis.plot(curve.steps, curve.mean, **look, markevery=every, markersize=4)
+                if len(runs) > 1:
+                    band = {"color": style["color"], "alpha": 0.2, "linewidth": 0}
+                    axis.fill_between(curve.steps, curve.low, curve.high, **band)
     limits = {(e.limits[key], e.runs[0].episode_length) for e in experiments if key in e.limits}
     for limit, length in limits:
         axes[1].axhline(limit, **LIMIT_STYLE)
         if length is not None:
             axes[2].axhline(limit / length, **LIMIT_STYLE)
-
-
-def _draw_curve(axis: Axes, curve: Average, style: Style, look: dict[str, Any]) -> None:
-    every = max(1, len(curve.steps) // _NUM_MARKERS)
-    axis.plot(curve.steps, curve.mean, **style.point, **look, markevery=every, markersize=4)
-    if np.isfinite(curve.low).all():  # several seeds
-        band: dict[str, Any] = {"color": style.colour, "alpha": 0.2, "linewidth": 0}
-        axis.fill_between(curve.steps, curve.low, curve.high, **band)
 
 
 def _set_axes(axes: Sequence[Axes], ticks: int) -> None:

@@ -12,7 +12,7 @@ from safe_rl.files import CONF
 from safe_rl.reporting.archive import Run
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
-from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Scores, Suite
+from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Suite
 
 PACKAGED = frozenset(file.stem for file in (CONF / "algo").glob("*.yaml"))
 """Names of the package's algorithms."""
@@ -65,11 +65,6 @@ class Experiment:
     def base(self) -> str:
         """Name of the file in ``conf/algo``."""
         return self.runs[0].algorithm
-
-    @property
-    def reference(self) -> Scores | None:
-        """Scores of the published PPO to normalise by, if the environment has them."""
-        return REFERENCE.get(self.benchmark or "")
 
     @property
     def limits(self) -> dict[str, float]:
@@ -235,11 +230,11 @@ def title_of(algorithm: str) -> str:
 
 def _settings(run: Run) -> dict[str, Hashable]:
     """The settings that may distinguish a run's algorithm from others of the same name."""
-    frames, settings = run.settings["frames"], experiment_of(run.settings)
+    settings = experiment_of(run.settings)
     # some keys only repeat the length of the run
-    repeated = {key for key, v in settings.items() if v == frames and role_of(key) is Role.LENGTH}
-    left_out = repeated - {"frames"} | {key for key in settings if key.startswith("env.")}
-    kept = {key: value for key, value in settings.items() if key not in left_out}
+    lengths = {key for key in settings if role_of(key) is Role.LENGTH} - {"frames"}
+    repeated = {key for key in lengths if settings[key] == run.settings["frames"]}
+    kept = {k: v for k, v in settings.items() if k not in repeated and not k.startswith("env.")}
     return {**kept, "source": run.source or None}
 
 

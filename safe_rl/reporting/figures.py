@@ -46,23 +46,16 @@ class Drawing(NamedTuple):
     shows: str
 
 
-class Style(NamedTuple):
-    """How an experiment is drawn; experiments with one algorithm share colour and marker."""
-
-    colour: str
-    marker: str
-    line: Any  # variants of an algorithm have different ones
-    is_filled: bool  # the first variant's markers, and of those that differ from it only in limits
-
-    @property
-    def point(self) -> dict[str, Any]:
-        """Matplotlib's keyword arguments of the marker."""
-        face = self.colour if self.is_filled else "white"
-        return {"marker": self.marker, "color": self.colour, "markerfacecolor": face}
+Style = dict[str, Any]
+"""Matplotlib's keyword arguments of an experiment's line and markers."""
 
 
 def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
-    """Label of an experiment -> its style, the same in every picture."""
+    """Label of an experiment -> its style, the same in every picture.
+
+    Experiments with one algorithm share colour and marker, and have different lines. Markers are
+    filled for the first variant, and for those that differ from it only in limits.
+    """
     variants: dict[str, set[tuple[int, str, str]]] = defaultdict(set)
     for e in experiments:
         variants[e.base].add((len(e.family), e.family, e.label))
@@ -70,11 +63,13 @@ def algorithm_styles(experiments: Iterable[Experiment]) -> dict[str, Style]:
     looks = dict(zip(known, _LOOKS, strict=False))
     further = cycle(_LOOKS[len(known) :])
     styles: dict[str, Style] = {}
-    for base, own_variants in sorted(variants.items()):
+    for base, of_base in sorted(variants.items()):
         colour, marker = looks.get(base) or next(further)
-        for number, (_, family, label) in enumerate(sorted(own_variants)):
+        for number, (_, family, label) in enumerate(sorted(of_base)):
+            face = colour if family == min(of_base)[1] else "white"
             line = (0, (7, 2, *(1, 2) * (number - 1))) if number else "-"
-            styles[label] = Style(colour, marker, line, family == min(own_variants)[1])
+            styles[label] = {"color": colour, "marker": marker, "markerfacecolor": face}
+            styles[label]["linestyle"] = line
     return styles
 
 
@@ -158,11 +153,11 @@ def _draw_front(axis: Axes, finals: Sequence[Final], styles: Mapping[str, Style]
         members.sort(key=lambda pair: pair[0].limits.get("cost", math.inf))
         style = styles[members[0][0].label]
         joined = np.array([(r["episode_cost"], r["episode_return"]) for _, r in members]).T
-        axis.plot(*joined, color=style.colour, linewidth=1, alpha=0.6)
+        axis.plot(*joined, color=style["color"], linewidth=1, alpha=0.6)
         for (experiment, record), cost, value in zip(members, *joined, strict=True):
             axis.errorbar(
                 cost, value, xerr=record["episode_cost_std"], yerr=record["episode_return_std"],
-                **style.point, linestyle="", elinewidth=0.8, markersize=7, label=literal(family),
+                **{**style, "linestyle": ""}, elinewidth=0.8, markersize=7, label=literal(family),
             )  # fmt: skip
             if len(members) > 1 and "cost" in experiment.limits:
                 text = f"≤ {experiment.limits['cost']:g}"

@@ -90,7 +90,8 @@ def test_an_algorithm_has_one_look_everywhere_that_no_other_one_has(tmp_path):
     write_run(tmp_path, "CarGoal1", "cpo", limits={"cost": 9.0})
     everything = experiments_in(tmp_path)
     styles = algorithm_styles(everything)
-    looks = {(e.base, *styles[e.label][:2]) for e in everything}
+    look_of = {label: (style["color"], style["marker"]) for label, style in styles.items()}
+    looks = {(e.base, *look_of[e.label]) for e in everything}
     assert len(looks) == len(PACKAGED) + 3
     assert len({look[1:] for look in looks}) == len(looks)
     assert algorithm_styles([e for e in everything if e.base == "ppo"])["PPO"] == styles["PPO"]
@@ -108,7 +109,7 @@ def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
         write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
     experiments = experiments_in(tmp_path)
     styles = algorithm_styles(experiments).values()
-    assert len({(style.colour, str(style.line)) for style in styles}) == 15
+    assert len({(style["color"], str(style["linestyle"])) for style in styles}) == 15
     # six in a picture, and unfinished runs are dotted
     lines = [figure.axes[0].lines for figure in learning_pictures(experiments)]
     assert [len(of_picture) for of_picture in lines] == [12, 12, 6]
