@@ -17,6 +17,20 @@ COLUMNS = [
 SUITE = suite()
 
 
+def estimate(value):
+    return {"value": value, "low": value - 1, "high": value + 1}
+
+
+EVALUATION = {
+    "checkpoint": "last", "steps": 3000, "episodes": 100, "deterministic": True, "env": {"x": 1},
+    "layouts_trained_on": 0.0, "cost_limits": {"cost": 25.0}, "cvar_alpha": 0.1,
+    "estimates": {
+        "episode_return": estimate(12.0), "episode_cost": estimate(21.0),
+        "cvar_cost": estimate(70.0), "over_limit_cost": estimate(0.25),
+    },
+}  # fmt: skip
+
+
 def grouped(root: Path):
     """Experiments below a folder, and what was left out for being a repetition."""
     runs, _ = find_runs(root)

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import yaml
-from synthetic import write_run
+from synthetic import EVALUATION, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.reporting.archive import ROWS, RUNS, archive_runs, find_runs, read_archive
@@ -84,35 +84,26 @@ def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):
     runtime = {"version": "1.3.8", "cwd": str(tmp_path), "config_sources": sources}
     notes = {"hydra": {"runtime": {**runtime, "output_dir": str(run)}, "job": {"name": "train"}}}
     (run / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(notes))
-    evaluation = {
-        "run": str(run), "checkpoint_file": f"{run}/checkpoints/last/checkpoint-1.torchrl",
-        "checkpoint": "last", "steps": 3, "episodes": 3, "name": "", "deterministic": True,
-        "env": {}, "layouts_trained_on": 0.0, "cvar_alpha": 0.1, "cost_limits": {},
-        "estimates": {},
-    }  # fmt: skip
+    checkpoint = f"{run}/checkpoints/last/checkpoint-1.torchrl"
+    evaluation = {**EVALUATION, "run": str(run), "checkpoint_file": checkpoint}
     (run / "evaluation.json").write_text(json.dumps(evaluation))
     (run / "evaluation_odd.json").write_text("no evaluation")
+    (run / ".hydra" / "config.yaml").write_text("env: {name: PointGoal1}\nframes: 500\n")
     code = [{"steps": 0, "version": "0.1.0", "commit": "0123456789abcdef", "changed": True}]
     (run / "code.json").write_text(json.dumps(code))
     keep(runs, kept)
     assert str(tmp_path) not in gzip.decompress((kept / RUNS).read_bytes()).decode()
-    (kept_evaluation,) = read_archive(kept)["PointGoal1/ppo/seed0"].notes["evaluations"]
+    archived = read_archive(kept)
+    assert archived["PointGoal1/ppo/seed0"].notes["frames_before"] == 500
+    assert "frames_before" not in archived["PointGoal1/ppo/seed1"].notes
+    (kept_evaluation,) = archived["PointGoal1/ppo/seed0"].notes["evaluations"]
     assert kept_evaluation.keys() == evaluation.keys() - {"run", "checkpoint_file"}
     # of what is kept, a copy, whose report has the command and the code
     keep(kept, tmp_path / "copy")
     assert main([str(tmp_path / "copy"), f"out={tmp_path / 'again'}"]) == 0
     page = (tmp_path / "again" / "report.html").read_text()
-    assert "--config-dir=mine/conf" in page
+    assert "--config-dir=mine/conf env=PointGoal1 algo=ppo seed=0 frames=3000" in page
     assert "0.1.0 0123456789 with changes" in page
-
-
-def test_of_what_a_run_was_to_be_at_first_only_its_length_is_kept(runs, tmp_path):
-    first = runs / "PointGoal1" / "ppo" / "seed0"
-    (first / ".hydra" / "config.yaml").write_text("env: {name: PointGoal1}\nframes: 500\n")
-    keep(runs, tmp_path / "kept")
-    found = {r.directory.name: r for r in find_runs(tmp_path / "kept")[0] if r.algorithm == "ppo"}
-    assert found["seed0"].notes["frames_before"] == 500
-    assert ["frames=3000" in found[seed].repeating for seed in ("seed0", "seed1")] == [True, False]
 
 
 def test_an_archive_that_is_written_half_way_has_the_runs_that_it_had(runs, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import os
 import re
 
 import yaml
-from synthetic import SUITE, write_run
+from synthetic import EVALUATION, SUITE, write_run
 
 from safe_rl.cli.report import main
 from safe_rl.files import printable
@@ -13,11 +13,6 @@ from safe_rl.reporting import ReportOptions, build_report
 
 SECRET = "hush-hush"
 EPOCHS = {"returns": (1.0, 2.0), "costs": (30.0, 20.0), "rates": (0.03, 0.02)}
-EVALUATION = {
-    "checkpoint": "last", "steps": 3000, "episodes": 100, "deterministic": True, "env": {},
-    "layouts_trained_on": 0.0, "cost_limits": {"cost": 25.0}, "cvar_alpha": 0.1,
-    "estimates": {"episode_return": {"value": 1.0, "low": 0.0, "high": 2.0}},
-}  # fmt: skip
 
 
 def change(run, **changes):
@@ -88,7 +83,7 @@ UNUSUAL = {
     "no costs": lambda run: [change(run, algo={"name": "a"}, cost_limits={}), table(run, FREE)],
     "infinite": lambda run: table(run, HEAD + "\n1,1000,1,inf,inf,-inf,1\n2,2000,1,nan,1,1,2"),
     "nothing finished": lambda run: table(run, HEAD + "\n1,1000,0,,,,1\n2,2000,0,,,,2"),
-    "NaN": lambda run: evaluate(run, json.dumps(EVALUATION).replace("2.0", "NaN")),
+    "NaN": lambda run: evaluate(run, json.dumps(EVALUATION).replace("13.0", "NaN")),
 }
 
 

@@ -72,6 +72,9 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
 
 def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     good = write_run(tmp_path)
+    wandb = good / "wandb" / "offline-run-20260131_120000-ab12" / "files"
+    wandb.mkdir(parents=True)
+    (wandb / "config.yaml").write_text("wandb_version: 1\n")  # is not even named
     foreign, unbegun, empty, torn, garbled = (
         write_run(tmp_path, seed=seed, folder=f"f{seed}") for seed in range(1, 6)
     )
@@ -83,10 +86,8 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     runs, skipped = find_runs(tmp_path)
     assert [run.directory for run in runs] == [good]
     reasons = {path.name: reason for path, reason in skipped.items()}
-    assert (
-        reasons["f1"]
-        == "config.yaml is not that of a run: it lacks a usable env, algo, seed, frames"
-    )
+    assert len(reasons) == 5
+    assert reasons["f1"].endswith("it lacks a usable env, algo, seed, frames")
     assert reasons["f2"] == "no progress.csv: it is no run of safe_rl, or has not begun"
     assert reasons["f3"] == "it has not finished an epoch"
     assert "progress.csv, line 3 has 1 fields" in reasons["f4"]
@@ -101,13 +102,6 @@ def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
         find_runs(tmp_path)
     with pytest.raises(FileNotFoundError, match="There is no folder"):
         find_runs(tmp_path / "elsewhere")
-
-
-def test_files_of_weights_and_biases_are_no_run(tmp_path):
-    files = write_run(tmp_path, folder="a") / "wandb" / "offline-run-20260131_120000-ab12" / "files"
-    files.mkdir(parents=True)
-    (files / "config.yaml").write_text("wandb_version: 1\n")
-    assert find_runs(tmp_path)[1] == {}
 
 
 def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):
@@ -130,6 +124,10 @@ def test_variants_are_told_apart_by_what_differs(tmp_path):
     write_run(tmp_path, algo="ppo_lagrangian", limits={"cost": 10.0}, folder="b")
     write_run(tmp_path, algo="mine", model={"hidden_sizes": [64]}, folder="c")
     write_run(tmp_path, algo="mine", model={"hidden_sizes": [8, 8]}, folder="d")
+    # what nobody has set is named where nothing else tells runs apart
+    for number in range(2):
+        loss = {"a": number, "b": number, "c": 1}
+        write_run(tmp_path, algo="yours", folder=str(number), loss=loss)
     multiplier = {"_target_": "safe_rl.objectives.PIDMultiplier", "ki": 0.1}
     write_run(tmp_path, algo="cpo", lagrangian=multiplier, folder="e")
     write_run(tmp_path, algo="cpo", lagrangian={"_target_": "some.LagrangeMultiplier"}, folder="f")
@@ -140,6 +138,8 @@ def test_variants_are_told_apart_by_what_differs(tmp_path):
         "CPO (lagrangian=PIDMultiplier)",
         "mine (model.hidden_sizes=[64])",
         "mine (model.hidden_sizes=[8,8])",
+        "yours (loss.a=0, loss.b=0)",
+        "yours (loss.a=1, loss.b=1)",
     ]
 
 
@@ -176,15 +176,6 @@ def test_names_leave_out_what_nobody_has_set(tmp_path):
     }
 
 
-def test_names_have_all_settings_where_those_that_were_set_tell_nothing_apart(tmp_path):
-    for number in range(2):
-        write_run(
-            tmp_path, algo="mine", folder=str(number), loss={"a": number, "b": number, "c": 1}
-        )
-    found = [e.algorithm for e in grouped(tmp_path)[0]]
-    assert found == [f"mine (loss.a={number}, loss.b={number})" for number in range(2)]
-
-
 def test_names_have_what_the_command_lines_of_their_runs_have_set(tmp_path):
     """Defaults that differ, as those of another version, are in no name."""
     said = ["algo=mine", "loss.a=2", "+memory=gru"]
@@ -201,11 +192,9 @@ def test_names_have_what_the_command_lines_of_their_runs_have_set(tmp_path):
 
 def test_how_long_a_run_is_is_said_once(tmp_path):
     for env, frames in (("PointGoal1", 2000), ("DoggoGoal1", 1000)):
-        write_run(tmp_path, env, "cpo", frames=frames, paper={})
-    for directory in tmp_path.glob("*/cpo/*"):
-        path = directory / "config.yaml"
-        frames = 2000 if "Point" in str(directory) else 1000
-        path.write_text(path.read_text() + f"limits: {{frames: {frames}}}\n")
+        run = write_run(tmp_path, env, "cpo", frames=frames)
+        with (run / "config.yaml").open("a") as file:
+            file.write(f"limits: {{frames: {frames}}}\n")
     assert {name for _, name, _ in names(grouped(tmp_path)[0])} == {"CPO"}
 
 
