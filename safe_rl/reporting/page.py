@@ -201,7 +201,8 @@ def _write(block: Block, out: Path, names: set[str], options: ReportOptions) -> 
     if isinstance(block, Table):
         block.write_csv(out / f"{name}.csv")
         return ""
-    for form in {*listed(options.formats), "png"}:  # the page needs PNG
+    # the page needs PNG; always first, as saving a figure moves its layout a little
+    for form in dict.fromkeys(["png", *listed(options.formats)]):
         save_figure(block.figure, out / f"{name}.{form}")
     return base64.b64encode((out / f"{name}.png").read_bytes()).decode()
 
