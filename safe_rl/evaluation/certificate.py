@@ -46,13 +46,14 @@ class Certificate:
         episodes = f"{verdict.episodes:,} new episodes"
         if self.test > 1:
             episodes += f", test {self.test} of this run; the level is that of all its tests"
+        if not verdict.tested:
+            return f"Not tested {level} {actions}: {self._episodes_needed_text()}"
         if self.checkpoint is None:
             missing = "; ".join(self._bound_text(name) for name in verdict.shortfalls)
-            line = (
+            return (
                 f"Not certified {level} {actions}: no checkpoint's bound is within its limit "
                 f"({missing}; {episodes})."
             )
-            return line + self._episodes_needed_text()
         head = f"Certified {level} {actions}"
         if set(verdict.by_construction) == set(verdict.bounds):
             head = f"Limit kept {actions}"
@@ -75,7 +76,7 @@ class Certificate:
     def may_need_training(self) -> bool:
         """Whether a policy of more training could be certified: every mean can have a bound."""
         bounds = [bound for bound, _ in self.verdict.bounds.values()]
-        return all(map(math.isfinite, [self.fewest, *bounds]))
+        return bool(self.verdict.tested) and all(map(math.isfinite, bounds))
 
     def _bound_text(self, name: str) -> str:
         bound, limit = self.verdict.bounds[name]
@@ -85,13 +86,12 @@ class Certificate:
         return f"{name} ≤ {rounded_up(bound):.3g}{why}, limit {limit:g}"
 
     def _episodes_needed_text(self) -> str:
-        if self.fewest <= self.options.episodes:
-            return ""
         if math.isinf(self.fewest):
-            return " No number of episodes can show this: the limit leaves no room below it."
+            return "no number of episodes can show this: the limit leaves no room below it."
         return (
-            f" So few episodes never suffice: at least {self.fewest:,.0f} are needed, even if none "
-            f"costs anything, and several times that as a rule (certificate.episodes=…)."
+            f"{self.options.episodes:,} episodes never suffice: at least {self.fewest:,.0f} are "
+            "needed, even if none costs anything, and several times that as a rule "
+            "(certificate.episodes=…)."
         )
 
     def _not_covered_text(self) -> str:

@@ -32,7 +32,7 @@ from safe_rl.files import read_json, replace_json, replacing
 from safe_rl.runs.checkpoints import policy_hash
 from safe_rl.runs.folder import checkpoint_steps, lock_folder
 from safe_rl.runs.run import Run
-from safe_rl.scores.certificate import Claim, error_of_next_test, first_certified, rank
+from safe_rl.scores.certificate import Claim, Verdict, error_of_next_test, first_certified, rank
 
 # number of environments that are stepped together, and of episodes between two checks of a test;
 # MuJoCo Warp takes nearly the same time for a thousand environments as for a hundred
@@ -81,7 +81,8 @@ def certify(
     All checkpoints are ranked by some episodes; the first ones are tested on new episodes. The
     result is written to ``certificate.json``, and the policy is saved as ``checkpoint=certified``.
     The level is that of all tests of the run together: each spends a part of the error, which the
-    run's folder keeps. The same test of the same checkpoints is repeated, and spends nothing.
+    run's folder keeps. The same test of the same checkpoints is repeated, and spends nothing. If no
+    test of so few episodes can succeed, none is made, and the folder stays as it is.
 
     Args:
         directory: Folder of the run.
@@ -110,19 +111,22 @@ def certify(
     evaluations = [PolicyEvaluation(config, path, plain, make) for path in candidates]
     claimed = ("most_over", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in claimed})
-    number, error = _spend(run, options, candidates)
+    number, error, noted = _next_test(run, options, candidates)
     claim = replace(claim, level=1 - error)
     order, claims = _ranked(evaluations, claim, options, progress)
     seed = _TEST + (number - 1) * _NEXT_TEST + (0 if run.has_begun else _OF_EXPORTED)
     # they share the error; how many there are is known before the first episode of the test
     tests = min(options.tests, len(candidates))
+    fewest = min(claims[candidate].fewest(tests) for candidate in order[:tests])
+    if fewest > options.episodes:
+        return Certificate(None, math.nan, Verdict(None, []), options, test=number, fewest=fewest)
+    replace_json(run.tests_file, noted)  # the error is spent before the first episode of the test
 
     def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
         for _, (episodes,) in _run([evaluations[candidate]], seed, options.episodes, progress):
             yield _costs(episodes)
 
     verdict = first_certified(order, collect, claims, tests, options.episodes)
-    fewest = claims[order[0]].fewest(tests)
     certificate = Certificate(None, math.nan, verdict, options, test=number, fewest=fewest)
     if (chosen := verdict.certified) is not None:
         # episodes of the test have decided when it ended: it ends when costs happen to be low
@@ -141,8 +145,10 @@ def certify(
     return certificate
 
 
-def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) -> tuple[int, float]:
-    """Number and error probability of a test of a run; both are noted before its first episode."""
+def _next_test(
+    run: Run, options: CertificateOptions, candidates: Sequence[Path]
+) -> tuple[int, float, list[dict[str, Any]]]:
+    """Number and error probability of a test, and the notes on all tests of its run with it."""
     tests = read_json(run.tests_file) if run.tests_file.is_file() else []
     is_list = isinstance(tests, list) and all(isinstance(former, dict) for former in tests)
     if not is_list or not all(is_number(former.get("error")) for former in tests):
@@ -151,7 +157,7 @@ def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) ->
     test["candidates"] = [path.name for path in candidates]
     for number, former in enumerate(tests, 1):
         if all(former.get(key) == value for key, value in test.items()):
-            return number, former["error"]
+            return number, former["error"], tests
     spent = [former["error"] for former in tests]
     error = error_of_next_test(options.level, spent)
     if error <= 0:
@@ -160,8 +166,7 @@ def _spend(run: Run, options: CertificateOptions, candidates: Sequence[Path]) ->
             f"{sum(spent):.3g}. All of its tests together can have a level below "
             f"{1 - sum(spent):.5g}: certificate.level={1 - 2 * sum(spent):.3g}"
         )
-    replace_json(run.tests_file, [*tests, {**test, "error": error}])
-    return len(tests) + 1, error
+    return len(tests) + 1, error, [*tests, {**test, "error": error}]
 
 
 def _ranked(

@@ -215,7 +215,7 @@ def test_a_run_is_measured_against_other_limits(run):
 def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
     certificate = run.certify(ranking=2, episodes=4, tests=1)
     assert certificate.options.episodes == 4
-    assert (run.directory / "certificate.json").is_file()
+    assert "4 episodes never suffice" in str(certificate)
     with pytest.raises(ValueError, match="made by certify"):
         run.evaluate(certify=True)
     with pytest.raises(ValueError, match=r"episodes=0: a test needs episodes"):
@@ -238,7 +238,7 @@ def test_a_certificate_takes_the_threads_and_options_of_its_run(run, monkeypatch
         "safe_rl.training.train.certify_run",
         lambda *said, **options: given.append((*said, options)),
     )
-    run.certificate_file.unlink()
+    run.certificate_file.unlink(missing_ok=True)
     safe_rl.resume(run.directory, **{"certificate.episodes": 4})
     ((directory, options),) = given
     assert directory == run.directory

@@ -89,17 +89,21 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
 
 
 def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
-    # two episodes can certify nothing
     status, out, _ = command(
-        *(*SMALL, "frames=40", "certificate.episodes=2", "certificate.ranking=2"),
-        *("cost_limits={cost: 0.5}", "hydra.run.dir=runs/unsafe", "import=json"),
+        *(*SMALL, "frames=400", "certificate.episodes=100", "certificate.ranking=2"),
+        *(
+            "cost_limits={cost: 1.1}",
+            "env.hazards_size=5",
+            "hydra.run.dir=runs/unsafe",
+            "import=json",
+        ),
     )
     assert not status
     line = out.splitlines()[-1]
     before, _, overrides = line.partition("python train.py ")
     assert before == "To train on: "
     assert command(*overrides.split())[0] == 0
-    assert int(read_table(Path("runs/unsafe/progress.csv"))["steps"][-1]) == 80
+    assert int(read_table(Path("runs/unsafe/progress.csv"))["steps"][-1]) == 800
 
 
 def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed(

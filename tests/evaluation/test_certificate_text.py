@@ -19,7 +19,8 @@ CHECKPOINT = Path("checkpoint-000000000100.torchrl")
 
 @pytest.mark.parametrize(("level", "shown"), [(0.995, "99.5%"), (0.95, "95%"), (0.999, "99.9%")])
 def test_levels_are_not_rounded(level, shown):
-    certificate = Certificate(None, math.nan, Verdict(None, []), replace(OPTIONS, level=level))
+    verdict = Verdict(None, [0])
+    certificate = Certificate(None, math.nan, verdict, replace(OPTIONS, level=level))
     assert f"at {shown} with sampled actions: " in str(certificate)
 
 
@@ -28,11 +29,7 @@ def test_the_bounds_that_miss_their_limits_are_shown_with_the_limits():
     verdict = Verdict(None, [0], bounds, {"mean_cost": 5.82}, [], {}, 20)
     certificate = Certificate(None, math.nan, verdict, OPTIONS)
     assert str(certificate).endswith("(mean_cost ≤ 10.9, limit 5; 20 new episodes).")
-    # 120 can never suffice
-    assert "at least 561 are needed" in str(replace(certificate, fewest=561))
-    assert "No number of episodes" in str(replace(certificate, fewest=math.inf))
     assert certificate.may_need_training
-    assert not replace(certificate, fewest=math.inf).may_need_training
     above = replace(verdict, bounds={"mean_cost": (math.inf, 5.0)}, shortfalls={"mean_cost": 5})
     said = str(replace(certificate, verdict=above))
     assert "mean_cost has no bound: costs are NaN, or above those that the specs" in said

@@ -118,6 +118,23 @@ def test_tests_of_a_run_spend_its_error_once_each(train):
         certify(directory, strict, make_env=make_env)
 
 
+@pytest.mark.parametrize(
+    ("limit", "why"),
+    [("19", "2 episodes never suffice: at least "), ("0", "no number of episodes can show this")],
+)
+def test_a_test_that_cannot_succeed_is_not_made_and_changes_nothing(train, limit, why):
+    directory = train("{cost: 19}")
+    assert certify(directory, OPTIONS, make_env=make_env).checkpoint is not None
+    if limit == "0":
+        config = directory / "config.yaml"
+        config.write_text(config.read_text().replace("cost: 19", "cost: 0"))
+    files = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    refused = certify(directory, replace(OPTIONS, episodes=2), make_env=make_env)
+    assert str(refused).startswith(f"Not tested at 95% with sampled actions: {why}")
+    assert not refused.may_need_training
+    assert files == {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
 def test_the_mean_beside_a_bound_is_of_episodes_that_did_not_end_the_test(train, monkeypatch):
     met = []
 
@@ -145,7 +162,7 @@ def test_mean_actions_are_certified_as_such(train):
 
 
 def test_none_is_certified_where_limits_are_broken_and_it_says_by_how_much(train):
-    directory = train("{cost_hazards: 0.01}")
+    directory = train("{cost_hazards: 2}")
     certificate = certify(directory, OPTIONS, make_env=make_env)
     assert certificate.checkpoint is None
     assert certificate.verdict.shortfalls["mean_cost_hazards"] > 0.1
@@ -176,8 +193,9 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
     after = certify(directory, OPTIONS, make_env=make_env).checkpoint
     assert after.name != before.name
     assert list(after.parent.iterdir()) == [after]
-    strict = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=0.0)
-    assert certify(directory, strict, make_env=make_env).checkpoint is None
+    config = directory / "config.yaml"
+    config.write_text(config.read_text().replace("cost: 19", "cost: 2"))
+    assert certify(directory, OPTIONS, make_env=make_env).checkpoint is None
     assert not json.loads((directory / "certificate.json").read_text())["certified"]
     with pytest.raises(FileNotFoundError):
         Run(directory).find_checkpoint("certified")
@@ -189,8 +207,9 @@ def test_an_exported_policy_is_certified_anew_and_keeps_its_weights(train, tmp_p
     weights = pack_policy(run, folder)
     mean = certify(folder, replace(OPTIONS, deterministic=True), make_env=make_env)
     assert mean.checkpoint == weights
-    strict = CertificateOptions(ranking=6, episodes=12, tests=2, level=0.95, most_over=0.0)
-    assert certify(folder, strict, make_env=make_env).checkpoint is None
+    config = folder / "config.yaml"
+    config.write_text(config.read_text().replace("cost: 19", "cost: 2"))
+    assert certify(folder, OPTIONS, make_env=make_env).checkpoint is None
     assert Run(folder).find_checkpoint("last").name == weights.name
     with pytest.raises(FileNotFoundError):
         Run(folder).find_checkpoint("certified")
