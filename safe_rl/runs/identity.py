@@ -6,6 +6,7 @@ Hydra's notes of a run have the settings of its command line: its command is mad
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -205,6 +206,11 @@ def measure_of(settings: Any) -> str:
     """
     target = (settings.get("risk") or {}).get("_target_") or "mean"
     return str(target).rpartition(".")[2]
+
+
+def whole_frames(config: DictConfig) -> int:
+    """Environment steps after which a run ends: ``frames``, rounded up to whole batches."""
+    return math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
 
 
 def is_to_keep_limits(config: DictConfig) -> bool:

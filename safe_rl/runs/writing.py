@@ -15,7 +15,7 @@ from safe_rl.checks import SettingError
 from safe_rl.files import replacing
 from safe_rl.runs.code_version import note_code
 from safe_rl.runs.folder import lock_folder
-from safe_rl.runs.identity import given_settings, measure_of
+from safe_rl.runs.identity import given_settings, measure_of, whole_frames
 from safe_rl.runs.progress_bar import ProgressBar
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableWriter, outcome_line, read_table
@@ -58,9 +58,7 @@ class RunWriter:
             if self._logger is not None and not epoch:
                 self._logger.log_hparams(given_settings(self.run.overrides or (), self.config))
             # whole batches, so that the last one does not go beyond the bar
-            batch = self.config.frames_per_batch
-            total = math.ceil(self.config.frames / batch) * batch
-            measure = measure_of(self.config)
+            total, measure = whole_frames(self.config), measure_of(self.config)
             self._bar = opened.enter_context(
                 ProgressBar(self.run.directory, total, steps, self.cost_limits, measure)
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import re
 import shutil
@@ -20,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from torchrl.checkpoint import CheckpointError
 
+from safe_rl.algorithms.algorithm_contract import Algorithm
 from safe_rl.checks import UNEXPECTED, SettingError
 from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
@@ -30,7 +30,7 @@ from safe_rl.evaluation.settings import certificate_options, has_tested_measure
 from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError, checkpoint_steps, lock_folder
-from safe_rl.runs.identity import is_to_keep_limits, measure_of
+from safe_rl.runs.identity import is_to_keep_limits, measure_of, whole_frames
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableError
 from safe_rl.training.building import begin_from, build_run, seed_everything
@@ -178,21 +178,15 @@ def _prepare(
             logging.getLogger(library).setLevel(logging.WARNING)
     if not (isinstance(callbacks, list | tuple) and all(map(callable, callbacks))):
         raise ConfigError(f"callbacks must be a list of functions, [f], got {callbacks!r}.")
-    if config.frames % config.frames_per_batch:
-        whole = math.ceil(config.frames / config.frames_per_batch) * config.frames_per_batch
-        print(f"Training for {whole:,} frames: whole batches of {config.frames_per_batch:,}.")
+    if config.frames < (frames := whole_frames(config)):
+        print(f"Training for {frames:,} frames: whole batches of {config.frames_per_batch:,}.")
     seed_everything(config.seed, config.num_threads)
     trainer = build_run(config, run)
     trainer.callbacks = callbacks
     algorithm = trainer.algorithm
-    if algorithm.learns_from:
-        print(algorithm.learns_from)
-    if algorithm.schedule:
-        say(algorithm.schedule)
-    if config.cost_limits and not is_to_keep_limits(config):
-        say(f"algo={config.algo.name} does not keep cost_limits: they are only reported.")
+    _announce(algorithm, config, say)
     if continues and trainer.resume():
-        print(f"Resuming after {trainer.progress.steps:,} of {config.frames:,} frames.")
+        print(f"Resuming after {trainer.progress.steps:,} of {frames:,} frames.")
         if trainer.snapshot is None:
             print("The state of its environments is not stored: they begin new episodes.")
         if algorithm.lost_on_resume:
@@ -207,13 +201,29 @@ def _prepare(
         if not (continues and run.robot_file.exists()):
             keep_robot(run, config.env)
     length = trainer.env.max_episode_steps
-    if config.frames < (first := config.num_envs * length):
+    if frames < (first := config.num_envs * length):
         say(
             f"No episode will end: {config.num_envs} environments with episodes of {length:,} "
             f"steps end the first ones after {first:,} frames. "
             "Set frames=… or num_envs=…"
         )
     return trainer
+
+
+def _announce(algorithm: Algorithm, config: DictConfig, say: Callable[[str], None]) -> None:
+    """Print what an algorithm learns from, and when its limits begin to hold."""
+    if algorithm.learns_from:
+        print(algorithm.learns_from)
+    if algorithm.schedule:
+        say(algorithm.schedule)
+        planned = OmegaConf.select(config, "limits.frames")
+        if planned is not None and whole_frames(config) < planned:
+            say(
+                f"This schedule was made for {planned:,} frames. If the limits are to fall sooner: "
+                f"limits.frames={config.frames:_}"
+            )
+    if config.cost_limits and not is_to_keep_limits(config):
+        say(f"algo={config.algo.name} does not keep cost_limits: they are only reported.")
 
 
 def _write_notes(run: Run, config: DictConfig, hydra: Any) -> None:
@@ -261,7 +271,7 @@ def certify_finished(
             f"{quote(str(run.directory))} certify=true{import_words(config)}"
         )
         return
-    if steps > config.frames:
+    if steps > whole_frames(config):
         given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
         say(
             f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "

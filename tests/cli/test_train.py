@@ -88,6 +88,21 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
     assert not Path("runs/short/certificate.json").exists()
 
 
+def test_what_is_said_at_the_start_is_about_whole_batches_and_the_schedule_that_the_run_has(command):
+    status, out, _ = command(*SMALL, "frames=30", "hydra.run.dir=runs/mine")
+    assert not status
+    assert "Training for 40 frames: whole batches of 40." in out
+    # two environments end their first episodes of 20 steps
+    assert "No episode will end" not in out
+    assert "This schedule" not in out
+    # resume=RUN frames=… leaves the schedule, which may then end after the run
+    status, out, _ = command("resume=runs/mine", "frames=70", "limits.frames=81")
+    assert not status
+    assert "This schedule was made for 81 frames. If the limits are to fall sooner: " in out
+    assert "Resuming after 40 of 80 frames." in out
+    assert "limits.frames=70" in out
+
+
 def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     status, out, _ = command(
         *(*SMALL, "frames=400", "certificate.episodes=100", "certificate.ranking=2"),
