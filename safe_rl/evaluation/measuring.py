@@ -45,14 +45,17 @@ class Evaluation:
     def __str__(self) -> str:
         """A table for the terminal."""
         facts, limits = self.facts, self.facts["cost_limits"]
+        changed = "".join(f", env.{key}={value}" for key, value in facts["env"].items())
         steps = "" if facts["steps"] is None else f" at {facts['steps']:,} steps"
+        known = facts["layouts_trained_on"]
         actions = "its mean actions" if facts["deterministic"] else "sampled actions"
         measure = facts["limited_measure"]
         other = "" if measure == "mean" else f" ({measure}, not mean)"
         width = max(map(len, self.estimates))
         lines = [
-            f"{facts['algorithm']} on {facts['environment']}{steps}: {facts['episodes']} episodes "
-            f"with {actions}, {facts['layouts_trained_on']:.0%} of the layouts known from training",
+            f"{facts['algorithm']} on {facts['environment']}{changed}, checkpoint "
+            f"{facts['checkpoint']}{steps}: {facts['episodes']} episodes with {actions}"
+            + (f", {known:.0%} of the layouts known from training" if known else ""),
             f"{'':{width}}  estimate [95 % interval]",
         ]
         for name, estimate in self.estimates.items():

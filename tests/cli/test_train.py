@@ -88,7 +88,9 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
     assert not Path("runs/short/certificate.json").exists()
 
 
-def test_what_is_said_at_the_start_is_about_whole_batches_and_the_schedule_that_the_run_has(command):
+def test_what_is_said_at_the_start_is_about_whole_batches_and_the_schedule_that_the_run_has(
+    command,
+):
     status, out, _ = command(*SMALL, "frames=30", "hydra.run.dir=runs/mine")
     assert not status
     assert "Training for 40 frames: whole batches of 40." in out

@@ -133,12 +133,17 @@ def test_a_checkpoint_that_training_removes_meanwhile_is_evaluated(run):
 def test_the_command_prints_a_table(run, capsys):
     assert main([str(run), "episodes=3", "num_envs=3", "num_threads=1"]) == 0
     shown = capsys.readouterr().out
-    assert shown.startswith("ppo_lagrangian on PointGoal1 at 320 steps: 3 episodes")
+    assert shown.startswith(
+        "ppo_lagrangian on PointGoal1, checkpoint last at 320 steps: 3 episodes"
+    )
     assert "95 % interval" in shown
     line = next(line for line in shown.splitlines() if line.startswith("episode_cost "))
     assert line.endswith("limit 25")
     assert f"wrote {run}/evaluation.json" in shown
     # a limit on another measure is not shown as one on the mean
     change_config(run, risk={"_target_": "safe_rl.objectives.CVaR", "tail": 0.1})
-    assert main([str(run), "episodes=3", "num_envs=3", "num_threads=1"]) == 0
-    assert "   limit 25 (CVaR, not mean)\n" in capsys.readouterr().out
+    changed = ("env.hazards_num=2", "checkpoint=best")
+    assert main([str(run), "episodes=3", "num_envs=3", "num_threads=1", *changed]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("ppo_lagrangian on PointGoal1, env.hazards_num=2, checkpoint best at ")
+    assert "   limit 25 (CVaR, not mean)\n" in shown

@@ -9,7 +9,6 @@ from safe_rl.reporting.scoring import (
     complete_slates,
     final_record,
     final_table,
-    normalised_scores,
     paper_table,
     slate_table,
 )
@@ -137,11 +136,18 @@ def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
     place = list(table.columns).index("limited measure")
     measures = [(row[place].text, row[place].mark) for row in table.rows()]
     assert measures == [("—", ""), ("35.0", "bad"), ("20.0", "")]
-    # slates ask the same, and nothing published stands beside another limit than the published
-    found = {e.algorithm: normalised_scores([e])["violation"][0] for e in experiments}
-    assert found["yours"] == 0.0
-    assert found["mine"] == pytest.approx(10 / (REFERENCE["PointGoal1"][1] - 25))
+    # published costs are means: they are no unit of another measure's violation
+    ((_, members),) = complete_slates(experiments, 1)
+    assert [e.algorithm for (e,) in members] == ["CPO"]
     assert [e.is_published_problem for e in experiments] == [True, False, False]
+
+
+def test_a_limit_that_the_published_ppo_keeps_has_no_normalised_violation(tmp_path):
+    for name, limit in (("cpo", 25.0), ("ppo", REFERENCE["PointGoal1"].episode_cost)):
+        rows = {"returns": [1.0], "costs": [limit + 1], "rates": [0.1]}
+        write_run(tmp_path, algo=name, **rows, limits={"cost": limit})
+    ((_, members),) = complete_slates(experiments_in(tmp_path), 1)
+    assert [e.algorithm for (e,) in members] == ["CPO"]
 
 
 def write_slate(root, algo, multiples):
