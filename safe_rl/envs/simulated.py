@@ -43,7 +43,7 @@ class SimulatedEnv(ConstrainedEnv):
     #: Keys that may be missing in a state that is set.
     optional: ClassVar[tuple[str, ...]] = ("seed", "episode", "dynamics")
     #: Attributes, tensors, that a copy gets in addition to the state.
-    copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun")
+    copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun", "_ended")
 
     #: Simulated time of a step [s].
     seconds_per_step: float
@@ -100,7 +100,7 @@ class SimulatedEnv(ConstrainedEnv):
         self._episode = torch.zeros(self.batch_size, dtype=torch.int64, device=physics.device)
         self._row_seed = torch.zeros_like(self._episode)
         self._has_cost = torch.zeros_like(self._episode, dtype=torch.bool)
-        self._begun = self._has_cost.clone()
+        self._begun, self._ended = self._has_cost.clone(), self._has_cost.clone()
         low, high = torch.from_numpy(model.actuator_ctrlrange.T.copy())
         self._control_range = (low.to(physics.ctrl), high.to(physics.ctrl))
         self.max_episode_steps = self.config.num_steps
@@ -154,6 +154,7 @@ class SimulatedEnv(ConstrainedEnv):
             self._dynamics.draw(rng.fold(self._row_seed, self._episode), mask)
         self._begin(mask)
         self._has_cost &= ~mask
+        self._ended &= ~mask
         self._begun |= mask
         self._all_begun = self._all_begun or bool(self._begun.all())
         return self._output(self._begun.new_zeros(len(self.flags), len(self._begun)))
@@ -161,6 +162,7 @@ class SimulatedEnv(ConstrainedEnv):
     def _output(self, flags: Tensor, numbers: Tensor | None = None) -> TensorDict:
         """Return the output of a reset or step: flags [F, N], and reward and costs [1 + K, N]."""
         outputs: dict[str, Any] = dict(zip(self.flags, flags.unsqueeze(-1), strict=True))
+        self._ended |= flags[self.flags.index("done")]
         if numbers is not None:
             names = ("reward", *self.cost_keys)
             outputs |= zip(names, numbers.to(torch.float32).unsqueeze(-1), strict=True)
@@ -178,7 +180,8 @@ class SimulatedEnv(ConstrainedEnv):
 
     def _checked_action(self, tensordict: TensorDictBase) -> Tensor:
         stepped = tensordict.get("_step", None)
-        if stepped is not None and not stepped.all():
+        # TorchRL leaves out what a world does after its episode, whether it is stepped or not
+        if stepped is not None and not (stepped.reshape(self.batch_size) | self._ended).all():
             raise NotImplementedError(
                 "A transform of TorchRL, such as ConditionalSkip or MultiAction, asks for a step "
                 "of some worlds only ('_step'), but all worlds are stepped together. Use "
@@ -246,6 +249,7 @@ class SimulatedEnv(ConstrainedEnv):
         self._row_seed = state.get("seed", self._row_seed).clone()
         self._episode = state.get("episode", self._episode).clone()
         self._has_cost.zero_()
+        self._ended.zero_()
         self._begun.fill_(True)
         self._all_begun = True
         return self._output(self._begun.new_zeros(len(self.flags), len(self._begun)))

@@ -184,6 +184,23 @@ def test_partial_resets_leave_other_rows_alone(name):
         states = [env.step_mdp(taken) for env, taken in zip(envs, steps, strict=True)]
 
 
+@pytest.mark.parametrize("name", ["PointGoal1", "SafeSwimmerVelocity"])
+def test_a_rollout_until_all_rows_have_ended_repeats_their_last_steps(name):
+    env = make_env({**env_node(name), "num_steps": 5}, num_envs=2, seed=0, num_threads=1)
+    state = env.rollout(2)[:, -1]["next"].select("observation", "done", "terminated", "truncated")
+    state = env.reset(state.set("_reset", torch.tensor([[True], [False]])))
+    ends = {"break_when_any_done": False, "break_when_all_done": True}
+    steps = env.rollout(9, auto_reset=False, tensordict=state, **ends)
+    assert steps.shape == (2, 5)  # row 0 began anew, row 1 has three steps left
+    assert steps["next", "done"].squeeze(-1).sum(1).tolist() == [1, 3]
+    for entry in ("observation", "reward", "cost"):
+        last = steps["next", entry][1, 2]
+        assert (steps["next", entry][1, 2:] == last).all()
+    # after a reset every step of every row counts
+    with pytest.raises(NotImplementedError, match="step of some worlds only"):
+        env.step(env.rand_action(env.reset()).set("_step", torch.tensor([True, False])))
+
+
 @pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
 def test_steps_of_some_rows_only_are_refused(name):
     skip = ConditionalSkip(lambda step: torch.tensor([True, False]))
