@@ -131,6 +131,7 @@ def _words(error: ValidationError) -> str:
     messages = [fault["msg"].removeprefix("Value error, ") for fault in error.errors()]
     # a union has a message for each of its types
     words = ", or ".join(dict.fromkeys(messages)).replace("Input should be", "it must be")
+    words = words.replace("a valid dictionary", "a dictionary, such as '{key: value}'")
     return words.replace(", or it must be", ", or")
 
 

@@ -71,9 +71,9 @@ def compose_run(
     words = [*_searched(places), *words]
     try:
         config = _compose(words, name)
+        name_choices(config, config.hydra)
     except COMPOSITION_ERRORS as error:
         raise ValueError(explain(error, [f"--config-name={name}", *words])) from error
-    name_choices(config, config.hydra)
     return config
 
 
@@ -150,7 +150,7 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     if taken:
         return f"{taken[1]}={taken[2]}: the package has one of this name. Rename your file."
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
-    absent = re.match(r"Missing mandatory value: (\S+)", str(cause or error))
+    absent = re.search(r"Missing mandatory value: (\S+)", str(cause or error))
     if absent and absent[1] in General.__annotations__:
         return _absent(absent[1])
     if cause is not None and str(error) != str(cause):

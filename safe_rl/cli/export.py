@@ -61,7 +61,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
                 "what they do (see its metadata), and a certificate is about both together."
             )
     else:
-        target = pack_policy(run.directory, target, which)
+        pack_policy(run.directory, target, which)
     print(f"wrote {target}")
     return 0
 

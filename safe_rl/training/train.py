@@ -89,7 +89,7 @@ def train(
     with _ending_cleanly(run, config), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
-            print(f"{done}: raise 'frames' to train on.")
+            print(f"{done}. To train on: {again} frames={2 * config.frames:_}")
             with closing(make_env(node_of(run, config), num_envs=1)) as env:
                 stopped_by, length = None, env.max_episode_steps
         else:

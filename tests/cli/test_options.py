@@ -51,7 +51,7 @@ def test_names_stay_as_they_are_written(name):
 @pytest.mark.parametrize(
     ("argument", "message"),
     [
-        ("env=CarGoal2", "env=CarGoal2: it must be a valid dictionary"),
+        ("env=CarGoal2", "env=CarGoal2: it must be a dictionary, such as '{key: value}'"),
         ("epsiodes=3", "Unknown option 'epsiodes'. Did you mean 'episodes'?"),
         ("episodes", "'episodes' is not an option: they are written key=value"),
         ("episodes=many", "episodes=many: it must be a valid integer"),

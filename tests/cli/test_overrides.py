@@ -31,6 +31,7 @@ WRONG = {
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
+    "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
     "transforms=[saut]": "no transforms 'saut'. Did you mean 'saute'",
     "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
     "preset=hard_tasks": "^preset=hard_tasks: algo=ppo_lagrangian has no 'memory'. .*algo=sac_lag",
@@ -101,6 +102,8 @@ def test_wrong_words_name_the_right_ones(argument):
     with pytest.raises(ValueError, match=WRONG[argument]) as caught:
         composed("logger=none", argument)
     assert len(str(caught.value).splitlines()) == 1
+    if argument == "env=gymnasium":  # where Hydra names the folder of a run
+        assert status_of(argument) == str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     assert not Path("runs/mine/certificate.json").exists()
     status, out, _ = command(resume)
     assert status == 0
-    assert "40 frames already: raise" in out
+    assert "40 frames already. To train on: " in out
     written = Path("runs/mine/certificate.json")
     assert written.exists()
     written.unlink()
@@ -149,7 +149,7 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     for episodes, is_certified in ((0, False), (100, False), (3, True)):
         status, out, _ = command(resume, f"certificate.episodes={episodes}")
         assert status == 0
-        assert "40 frames already: raise 'frames' to train on." in out
+        assert "40 frames already. To train on: " in out
         assert ("fewer than 400, a fifth" in out) == (episodes == 100)
         assert written.exists() == is_certified
     assert json.loads(written.read_text())["most_episodes"] == 3
