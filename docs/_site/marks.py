@@ -26,22 +26,13 @@ def listed(kind: str) -> str:
     for page in sorted(PAGES.glob("*.md")):
         short = re.search(r"^<!-- row: (.*) -->$", text := page.read_text(), re.M)
         source = re.search(r"^\[`algo=\w+`\]\(\S+\) · (.*)$", text, re.M)
-        has_buffer = re.search(r"made: columns .*memory", text) is not None
+        has_buffer = re.search("groups .*`memory`", text) is not None
         if short and source and has_buffer == (kind == "OffPolicy"):
             rows.append(f"| [`{page.stem}`]({page.name}) | {short[1]} | {source[1]} |")
     return "\n".join([_HEAD, *rows])
 
 
-def columns(names: str) -> str:
-    """Rows of the tables of columns.md whose last cell has one of the groups."""
-    text = (PAGES / "columns.md").read_text()
-    found = re.findall(r"^(\| `.* \|) ([\w, ]+) \|$", text, re.M)
-    rows = [row for name in names.split() for row, groups in found if name in groups.split(", ")]
-    head = "| column, besides [those of every run](columns.md#every-algorithm) | meaning |"
-    return "\n".join([head, "|---|---|", *rows])
-
-
-_ALL = (listed, columns, *environment_tables.TABLES, *result_tables.TABLES)
+_ALL = (listed, *environment_tables.TABLES, *result_tables.TABLES)
 TABLES: dict[str, Callable[..., str]] = {table.__name__: table for table in _ALL}
 
 

@@ -1,4 +1,4 @@
-"""What pages ask the site to make: `<!-- made: columns ppo -->`, and the algorithms' pages."""
+"""The algorithms' pages, and what pages ask the site to make: `<!-- made: measured ppo -->`."""
 
 import re
 from pathlib import Path
@@ -20,5 +20,6 @@ def made(page, name):
 
 
 def columns_of(algo):
-    """Tables of the columns that an algorithm logs."""
-    return made(page_of(algo), "columns").split()
+    """Groups of the columns that an algorithm logs."""
+    (line,) = re.findall(r"^The \[columns\].* groups (.*)\.$", page_of(algo), re.M)
+    return re.findall(r"`(\w+)`", line)
