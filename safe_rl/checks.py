@@ -124,6 +124,8 @@ def _shown(value: Any) -> str:
     """A value as a command line has it, cut if it is long."""
     is_word = value is None or isinstance(value, bool)
     shown = json.dumps(value) if is_word else " ".join(str(value).split())
+    if isinstance(value, str) and shown.replace(".", "", 1).isdigit():
+        shown = repr(shown)  # a text is refused that looks like a number
     return shown if len(shown) <= 80 else f"{shown[:80]}…"
 
 
@@ -131,6 +133,7 @@ def _words(error: ValidationError) -> str:
     messages = [fault["msg"].removeprefix("Value error, ") for fault in error.errors()]
     # a union has a message for each of its types
     words = ", or ".join(dict.fromkeys(messages)).replace("Input should be", "it must be")
+    words = words.replace("Field required", "an entry is missing")
     words = words.replace("a valid dictionary", "a dictionary, such as '{key: value}'")
     return words.replace(", or it must be", ", or")
 

@@ -74,6 +74,7 @@ def test_no_value_ends_in_a_traceback():
     ("path", "value", "words"),
     [
         ("frames", "abc", "frames=abc: it must be a valid integer"),
+        ("frames", "25", "frames='25': it must be a valid integer"),
         ("frames", 2.5, "frames=2.5: it must be a valid integer"),
         ("num_envs", 0, "num_envs=0: it must be greater than or equal to 1"),
         ("model.memory", "a\nb", "model.memory must have the keys size"),

@@ -167,6 +167,13 @@ def test_a_batch_resets_rows_itself():
         envs.reset(options={"reset_mask": np.array([True, False])})
 
 
+def test_actions_of_another_number_of_environments_are_refused_by_their_number():
+    envs = gymnasium.make_vec("Safexp-PointGoal1-v0", num_envs=2)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"There are 2 environments.*\(3, 2\): give one row for e"):
+        envs.step(np.zeros((3, 2), np.float32))
+
+
 def test_some_worlds_may_get_a_seed_of_their_own():
     envs = gymnasium.make_vec("Safexp-PointGoal2-v0", num_envs=3, config=SHORT)
     first, _ = envs.reset(seed=np.array([3, 11, 3]))

@@ -110,6 +110,11 @@ class Worlds:
     ) -> tuple[Observation, tuple[Any, Any, Any], dict[str, Any]]:
         """Take a step; return observation, (reward, terminated, truncated) [N] each, and infos."""
         action = torch.as_tensor(actions, dtype=torch.float32, device=self.batch.device)
+        if action.shape[:1] != self.batch.batch_size:
+            raise ValueError(
+                f"There are {self.batch.batch_size[0]} environments, and actions of the shape "
+                f"{tuple(action.shape)}: give one row for each."
+            )
         step = self.batch.step(TensorDict({"action": action}, self.batch.batch_size))["next"]
         names = ("reward", "terminated", "truncated", *self.batch.cost_keys, *self.batch.events)
         column = {name: step[name].squeeze(-1).cpu().numpy() for name in names}
