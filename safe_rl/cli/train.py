@@ -80,7 +80,7 @@ def prepare(words: Sequence[str]) -> list[str]:
         ['env=PointGoal1,PointGoal2,PointButton1,PointButton2,PointPush1,PointPush2', 'seed=0', '-m']
     """  # noqa: E501
     # To list its groups for a help, Hydra copies the store a hundred times: ten seconds with all
-    # environments. But a file of the user's may build on any of them.
+    # environments, whose names are in the help's header. But a file of the user's may build on any.
     has_files = any(word.startswith(("-c", "--config-", "hydra.searchpath=")) for word in words)
     shown = [word.removeprefix("env=") for word in words if word.startswith("env=")]
     is_help = bool({"--help", "-h"} & {*words}) and not has_files

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Container, Mapping
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -53,6 +54,11 @@ _IN_STORE: dict[str, dict[str, Any]] = {}  # what Hydra's ConfigStore has, by na
 # an id may have a namespace, such as ALE/Pong-v5; its name is that of a folder
 OmegaConf.register_new_resolver(
     "safe_rl.folder_name", lambda name: name.replace("/", "-"), replace=True
+)
+OmegaConf.register_new_resolver(
+    "safe_rl.environments",
+    lambda: fill(", ".join([*env_names(), *FOREIGN, *_STORED]), 100, break_on_hyphens=False),
+    replace=True,
 )
 
 
@@ -137,12 +143,12 @@ def store_config(name: str, config: Mapping[str, Any] | SafetyGymConfig | Veloci
     store_configs()
 
 
-def store_configs(whole: Container[str] | None = None) -> None:
-    """Put all environments into Hydra's ConfigStore, as in `env=PointGoal1 env.hazards_num=3`.
+def store_configs(names: Container[str] | None = None) -> None:
+    """Put environments into Hydra's ConfigStore, as in `env=PointGoal1 env.hazards_num=3`.
 
     Args:
-        whole: Names of those that have their keys; None: all. Of the others only the names can be
-            listed. Hydra copies its store once per configuration group to print its help.
+        names: Names of the environments; None: all. To print its help, Hydra copies its store once
+            per configuration group.
     """
     rows: dict[str, dict[str, Any]] = {}
     for name, keys in (SUITE | EXTRAS | _STORED).items():
@@ -154,8 +160,8 @@ def store_configs(whole: Container[str] | None = None) -> None:
     for name, family in FOREIGN.items():
         head = {"_target_": family.target, "name": "${safe_rl.folder_name:${.id}}", "id": "???"}
         rows[name] = {**{key: Key(value, str) for key, value in head.items()}, **family.keys}
-    if whole is not None:
-        rows = {name: row if name in whole else {} for name, row in rows.items()}
+    if names is not None:
+        rows = {name: row for name, row in rows.items() if name in names}
     rows[SAFETY_GYM] = {"name": Key(SAFETY_GYM, Text), **KEYS}
     for name, row in rows.items():
         if row != _IN_STORE.get(name):  # nodes of all would take a third of a second
