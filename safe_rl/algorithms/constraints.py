@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Self
 
 import torch
@@ -126,7 +127,7 @@ class Constraints(Resumable):
 
         Raises:
             KeyError: If the accounting of the episodes lacks a cost that has a limit.
-            ValueError: If the batch has another shape.
+            ValueError: If the batch or a cost has another shape.
         """
         if batch.ndim != 2:
             raise ValueError(
@@ -134,15 +135,21 @@ class Constraints(Resumable):
                 "and steps: batch.unsqueeze(0) of one environment's."
             )
         if self.tracker is None:
-            return self._compare_episodes(batch, episodes)
-        costs = torch.cat([batch["next", key] for key in self.keys], -1)
+            return replace(self._compare_episodes(batch, episodes), keys=tuple(self.keys))
+        columns = [batch["next", key] for key in self.keys]
+        if any(column.shape != (*batch.shape, 1) for column in columns):
+            raise ValueError(
+                f"The costs {self.keys} must have the shape {[*batch.shape, 1]}, got "
+                f"{[list(column.shape) for column in columns]}."
+            )
+        costs = torch.cat(columns, -1)
         if self.risk is not None:
             steps, ends = costs.cpu(), batch["next", "done"].squeeze(-1).cpu()
             before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
             finished = episodes.episode_costs(self.keys).cpu()
             self._measured = self.risk(steps, ends, before.to(steps), finished)
         state = self.tracker.update(costs, episodes.decisions, self._measured)
-        return state.to(self.limits)
+        return replace(state.to(self.limits), keys=tuple(self.keys))
 
     def _compare_episodes(self, batch: TensorDictBase, episodes: EpisodeStatistics) -> LimitState:
         """Compare the mean of finished episodes with d.

@@ -81,7 +81,8 @@ class CPOStep(TRPOStep):
         if self.largest_required_decrease is None:
             return c
         within_reach = (2 * self.target_kl * s.clamp_min(0)).sqrt()
-        return torch.minimum(c, self.largest_required_decrease * within_reach)
+        bounded = torch.minimum(c, self.largest_required_decrease * within_reach)
+        return torch.where(within_reach > 0, bounded, c)  # without a gradient none is in reach
 
     @staticmethod
     def _acceptance(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from safe_rl.objectives.cost_values import CostValues, MeanCosts
 from safe_rl.objectives.critics import critic_bias
-from safe_rl.objectives.limits import LimitState
+from safe_rl.objectives.limits import LimitState, check_order
 from safe_rl.objectives.multipliers import Multiplier
 from safe_rl.objectives.q_functions import QFunctionLoss, check_ensemble, discount_of
 from safe_rl.objectives.samples import sample_mask
@@ -88,6 +88,7 @@ class CostCritics(QFunctionLoss):
         self.cost_keys, self._read = list(cost_keys), list(cost_qvalue_network.in_keys[:-1])
         if multiplier.num_costs != len(self.cost_keys):
             raise ValueError(f"{multiplier.num_costs} multipliers for the costs {self.cost_keys}.")
+        check_order(self.cost_keys, multiplier.cost_keys)
         super().__init__(actor_network, qvalue_network, **settings)
         self.convert_to_functional(
             cost_qvalue_network, "cost_qvalue_network", create_target_params=True

@@ -81,8 +81,16 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
     def _act(self, steps: TensorDictBase, params: TensorDictBase) -> Tensor:
         inputs = steps.select(*self.actor_network.in_keys, strict=False)
+        failure = None
+        # after an exception tensordict would leave these tensors in the policy
         with params.to_module(self.actor_network, preserve_module_state=False):
-            return self.actor_network(inputs).get(self.tensor_keys.action)
+            try:
+                action = self.actor_network(inputs).get(self.tensor_keys.action)
+            except Exception as error:
+                failure = error
+        if failure is not None:
+            raise failure
+        return action
 
     def actor_losses(self, tensordict: TensorDictBase) -> TensorDict:
         """Loss of the policy, and the mean value of its actions."""

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import NestedKey
 from torch import Tensor
 
 from safe_rl.checks import Checked, Fraction, Share, Weight
@@ -41,6 +42,7 @@ class LimitState:
         integral: Weighted sum of the violations so far, with this batch's, which steps add to the
             present one, [k].
         is_new: Whether the batch has changed `cost`. If not, multipliers stay as they are.
+        keys: Names of the costs, by which a multiplier finds that its own are in another order.
 
     Examples:
         >>> state = LimitState.of(cost=[30.0], limit=[25.0], length=1000.0)
@@ -56,6 +58,7 @@ class LimitState:
     realised_share: Tensor
     integral: Tensor
     is_new: bool = True
+    keys: tuple[NestedKey, ...] = ()
 
     @classmethod
     def of(
@@ -135,6 +138,15 @@ class LimitState:
         return replace(self, **tensors)
 
 
+def check_order(costs: Sequence[NestedKey], others: Sequence[NestedKey]) -> None:
+    """Refuse costs that are those of a multiplier in another order."""
+    if [*costs] != [*others] and sorted(map(str, costs)) == sorted(map(str, others)):
+        raise ValueError(
+            f"The costs {[*costs]} are those of the multiplier in another order, {[*others]}: λ "
+            "would go to another cost."
+        )
+
+
 class PredictedChange(Resumable):
     """Share of predicted changes of J_c that was observed, by a regression through the origin.
 
@@ -183,7 +195,7 @@ class LimitTracker(Checked, Resumable):
         max_length: Largest length of an episode, in time steps of a batch.
         margin: Distance of the target below the limit, in standard errors of a batch's J_c.
         largest_margin: Upper bound of the margin, as a share of d.
-        free_steps: Environment steps at the start during which costs have no effect.
+        free_steps: Environment steps at the start in which the limit is a scale above the cost.
         descent_steps: Environment steps, after free_steps, during which the limit falls to d.
         steps_per_decision: Environment steps per time step of a batch, which is one action.
         frames: Environment steps of the whole run.

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from safe_rl.checks import Checked, Weight, check_value
-from safe_rl.objectives.limits import LimitState
+from safe_rl.objectives.limits import LimitState, check_order
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Interval(gt=0, le=1e6)]
@@ -100,13 +100,15 @@ class Multiplier(Checked, nn.Module, ABC):
         multiplier of this cost and its state do not change.
 
         Raises:
-            ValueError: If there is not one limit per cost, or λ falls below 0.
+            ValueError: If there is not one limit per cost, costs are in another order, or λ falls
+                below 0.
         """
         if state.violation.shape != (self.num_costs,):
             raise ValueError(
                 f"update() needs one violation for each of {self.cost_keys}, "
                 f"got shape {tuple(state.violation.shape)}."
             )
+        check_order(state.keys, self.cost_keys)
         state = state.to(self.limits)
         known = state.violation.isfinite() & state.is_new
         for name, new in self._step(state).items():

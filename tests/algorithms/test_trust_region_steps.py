@@ -272,10 +272,11 @@ def test_cpo_without_cost_gradient_is_trpo():
     assert metrics["case"] == 4
     torch.testing.assert_close(flatten(actor.parameters()), flatten(twin.parameters()))
     before = flatten(actor.parameters()).detach().clone()
-    metrics = cpo_step(actor)(batch, limit_state(25.0))
-    assert metrics["case"] == 0
-    assert torch.equal(flatten(actor.parameters()), before)
-    assert all(torch.as_tensor(value).isfinite().all() for value in metrics.values())
+    for settings in ({}, {"largest_required_decrease": 0.95}):  # of which none is in reach
+        metrics = cpo_step(actor, **settings)(batch, limit_state(25.0))
+        assert metrics["case"] == 0
+        assert torch.equal(flatten(actor.parameters()), before)
+        assert all(torch.as_tensor(value).isfinite().all() for value in metrics.values())
 
 
 def test_errors_say_what_to_change():

@@ -207,7 +207,7 @@ def test_a_saved_state_goes_on_as_if_it_had_never_stopped():
         whole.predictions.record_prediction(torch.tensor([-3.0]))
     second.load_state_dict(whole.state_dict())
     states = [each.update(last, NO_EPISODES) for each in (whole, second)]
-    tensors = [[v for v in vars(state).values() if v is not True] for state in states]
+    tensors = [[v for v in vars(state).values() if torch.is_tensor(v)] for state in states]
     assert all(map(torch.equal, *tensors))
 
 
@@ -224,7 +224,7 @@ def test_another_default_dtype_of_torch_changes_nothing():
                 multiplier.update(state)
         finally:
             torch.set_default_dtype(torch.float32)
-        states.append([v for v in vars(state).values() if v is not True] + [multiplier.value])
+        states.append([v for v in vars(state).values() if torch.is_tensor(v)] + [multiplier.value])
     assert all(map(torch.equal, *states))
     assert all(value.dtype == torch.float32 for value in states[1])
 
@@ -240,6 +240,25 @@ def test_batches_of_one_environment_need_their_dimension():
     batch = TensorDict(next={"cost": torch.ones(5, 1)}, batch_size=[5])
     with pytest.raises(ValueError, match=r"shape \[5\].*batch\.unsqueeze\(0\)"):
         Constraints({"cost": 1.0}).update(batch, None)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (3, 5, 2)])
+def test_costs_of_a_batch_need_their_last_dimension(shape):
+    batch = TensorDict({"next": {"cost": torch.ones(shape)}}, [3, 5])
+    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
+    with pytest.raises(ValueError, match=r"must have the shape \[3, 5, 1\], got"):
+        Constraints({"cost": 1.0}, tracker=tracker()).update(batch, episodes)
+
+
+def test_costs_in_another_order_than_those_of_the_multiplier_are_refused():
+    state = Constraints({"a": 5.0, "b": 1.0}, tracker=tracker(5.0, 1.0)).update(
+        TensorDict({"next": {key: torch.ones(3, 5, 1) for key in "ab"}}, [3, 5]),
+        EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {}),
+    )
+    for limits in ({"a": 5.0, "b": 1.0}, [5.0, 1.0]):  # without names nobody knows
+        ProjectedMultiplier(limits, init=0.0, lr=0.01, highest=None).update(state)
+    with pytest.raises(ValueError, match="another order"):
+        ProjectedMultiplier({"b": 1.0, "a": 5.0}, init=0.0, lr=0.01, highest=None).update(state)
 
 
 def test_every_limited_cost_has_to_be_counted():

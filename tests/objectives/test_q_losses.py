@@ -203,6 +203,18 @@ def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused
         SACLagrangianLoss(*networks, critic, multiplier=multiplier, cost_keys=COSTS, **SAC)
     with pytest.raises(ValueError, match="2 multipliers for the costs"):
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)
+    with pytest.raises(ValueError, match="another order"):
+        SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=COSTS[::-1], **SAC)
+
+
+def test_a_minibatch_that_fails_leaves_the_policy_its_parameters():
+    """Or an optimiser would move others than those that collect."""
+    loss, steps = make_loss("td3", lagrange(1.0, 1.0)), make_steps()
+    before = [*loss.actor_network.parameters()]
+    assert before
+    with pytest.raises(KeyError):
+        loss(steps.exclude(("next", "observation")))
+    assert [*map(id, loss.actor_network.parameters())] == [*map(id, before)]
 
 
 def test_the_smoothing_of_td3_is_of_the_range_of_actions():
