@@ -150,7 +150,7 @@ def read_config(path: Path) -> dict[str, Any]:
         {'seed': 3, 'model': {'hidden_sizes': [64, 64]}}
     """
     config = read_yaml(path)
-    if not isinstance(config, dict) or not _all_plain(config):
+    if not isinstance(config, dict) or not is_plain(config):
         raise ValueError(
             f"{path.name} is not that of a run: it has to be a mapping without interpolations, "
             "${…}, and without control characters"
@@ -158,12 +158,13 @@ def read_config(path: Path) -> dict[str, Any]:
     return config
 
 
-def _all_plain(value: Any) -> bool:
+def is_plain(value: Any) -> bool:
+    """Whether all texts in a value of YAML have no interpolations and no control characters."""
     if isinstance(value, dict):
-        keys_are_texts = all(isinstance(key, str) and _all_plain(key) for key in value)
-        return keys_are_texts and all(map(_all_plain, value.values()))
+        keys_are_texts = all(isinstance(key, str) and is_plain(key) for key in value)
+        return keys_are_texts and all(map(is_plain, value.values()))
     if isinstance(value, list):
-        return all(map(_all_plain, value))
+        return all(map(is_plain, value))
     # control characters could change what a terminal shows, or control it
     return not (isinstance(value, str) and ("${" in value or _CONTROLS.search(value)))
 

@@ -64,6 +64,7 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             f"{needed:,} (exploration.random_steps, memory.n_steps)."
         )
         return warning if frames < needed else "", True
+    node.path = str(Path(node.path).expanduser())
     steps, interface = read_dataset(node.path), read_columns(node.path)
     try:
         learns_from = _fill(buffer, steps, interface, node, config.cost_limits, env)

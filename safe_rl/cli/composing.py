@@ -265,7 +265,7 @@ def read_resumed(
     _refuse_foreign_cluster(config, words, directory)
     if modules is not None:
         config["import"] = list(modules)
-    if any(re.match(r"logger=\w", word) for word in words):
+    if any(re.match(r"logger='?\w", word) for word in words):
         config.pop("logger", None)  # keys of another logger would stay
     place = str(directory).replace("${", "\\${")
     return {
@@ -280,7 +280,9 @@ def _read(directory: Path) -> dict[str, Any]:
     try:
         config = dict(run.settings)
         if run.checkpoints_folder.exists() and not run.has_begun:
-            raise ValueError("it has no progress.csv: an exported policy cannot be trained on")
+            raise ValueError(
+                "it has no progress.csv: an exported policy cannot be trained on; restore a run's"
+            )
         for key in ("hydra", "defaults"):
             if key in config:
                 raise ValueError(f"{run.config_file.name} has the key '{key}', which no run writes")

@@ -38,6 +38,7 @@ from safe_rl.files import read_bounded
 from safe_rl.models import HeldActions
 from safe_rl.runs.curves import Figure, learning_curves
 from safe_rl.runs.folder import new_folder
+from safe_rl.runs.run import KINDS
 from safe_rl.runs.run import Run as RecordedRun
 from safe_rl.scores.bounds import rounded_up
 from safe_rl.training import train as training
@@ -244,9 +245,9 @@ class Run(RecordedRun):
     """
 
     def __init__(self, directory: Path | str, checkpoint: str = "last") -> None:
-        # it is read later, perhaps from another working directory
+        # they are read later, perhaps from another working directory
         super().__init__(Path(directory).absolute())
-        self.checkpoint = checkpoint
+        self.checkpoint = checkpoint if checkpoint in KINDS else str(Path(checkpoint).absolute())
 
     @cached_property
     def env(self) -> EnvBase:
@@ -292,7 +293,8 @@ class Run(RecordedRun):
         """The same for a notebook, with the learning curves."""
         text = f"<pre>{html.escape(repr(self))}</pre>"
         curves = self.curves_file
-        picture = base64.b64encode(read_bounded(curves, 10**8)).decode() if curves.is_file() else ""
+        is_drawn = curves.is_file() and not curves.is_symlink()  # a link may lead to any file
+        picture = base64.b64encode(read_bounded(curves, 10**8)).decode() if is_drawn else ""
         shown = f'<img alt="learning curves" src="data:image/png;base64,{picture}">'
         return text + (shown if picture else "")
 

@@ -11,6 +11,7 @@ import math
 import os
 import sys
 import traceback
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -147,6 +148,12 @@ class Summary(Callback):
         if not last:
             sys.exit("The sweep has no runs: a glob(…) or range(…) in it is empty.")
         unfinished = [f"  {state}: {place}" for state, place in last if state != "done"]
+        if shared := [place for place, jobs in Counter(p for _, p in last).items() if jobs > 1]:
+            print(
+                f"Several jobs have the folder {shared[0]}, in which only the first has trained: "
+                "what they differ in is not in its name. To train all of them: "
+                "hydra.sweep.subdir='my_sweep/${hydra.job.num}'"
+            )
         print(f"Sweep: {len(last) - len(unfinished)} of {len(last)} runs are finished.")
         if unfinished:
             print(*unfinished, sep="\n")

@@ -152,7 +152,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
         raise ValueError(f"{path} holds no transitions.")
     steps = TensorDict(batch_size=[1, number])
     for key, array in arrays.items():
-        column = torch.from_numpy(array.reshape(1, number, -1))
+        native = array.astype(array.dtype.newbyteorder("="), copy=False)
+        column = torch.from_numpy(native.reshape(1, number, -1))
         steps[key] = column if key in _FLAGS else column.float()
     steps["next", "done"] = steps["next", "terminated"] | steps["next", "truncated"]
     return steps

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from safe_rl.evaluation.episodes import exploration
 from safe_rl.evaluation.loading import load_policy, transforms_of
 from safe_rl.extras import import_extra
-from safe_rl.files import read_yaml, replace_json, replacing, save_tensors
+from safe_rl.files import check_no_links, read_yaml, replace_json, replacing, save_tensors
 from safe_rl.models import BehaviourPolicy, ExploringPolicy, make_behaviour
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
@@ -72,6 +72,7 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
         FileNotFoundError: If there is no such checkpoint.
         FileExistsError: If the folder has other files than an exported policy's.
     """
+    check_no_links(run)  # or files that they lead to would be given away
     source, target = Run(run), Run(folder)
     path, config = source.find_checkpoint(checkpoint), source.config
     is_exported = (folder / "policy.json").is_file() and folder.resolve() != run.resolve()

@@ -57,6 +57,7 @@ ROLES: dict[str, Role] = {
     # restored from checkpoints: another value would have no effect, or not fit
     "critic_update.optimizer": Role.EXPERIMENT,
     "policy_update.optimizer": Role.EXPERIMENT,
+    "policy_update.rates": Role.EXPERIMENT,
     "lagrangian.init": Role.EXPERIMENT,
     "lagrangian.scale": Role.EXPERIMENT,
     "lagrangian.derivative_delay": Role.EXPERIMENT,

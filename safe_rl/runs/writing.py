@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.checks import SettingError
-from safe_rl.files import replacing
+from safe_rl.files import is_plain, replacing
 from safe_rl.runs.code_version import note_code
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.identity import given_settings, measure_of, whole_frames
@@ -81,6 +81,8 @@ class RunWriter:
 
     def _save_config(self) -> None:
         if not self._is_config_saved:
+            if not is_plain(OmegaConf.to_container(self.config, resolve=True)):
+                raise SettingError("A text has '${' or control characters: no run could be opened.")
             # replaced atomically: a run killed here can still be continued
             with replacing(self.run.config_file) as unfinished:
                 OmegaConf.save(self.config, unfinished, resolve=True)

@@ -86,7 +86,7 @@ def train(
     run, say = Run(directory), print_line if program else lambda line: None
     complete(config, run)
     again = _command_again(run, config, program)
-    with _ending_cleanly(run, config), lock_folder(run.lock_file):
+    with _ending_cleanly(run, config), _alone(run), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
             print(f"{done}. To train on: {again} frames={2 * config.frames:_}")
@@ -111,6 +111,21 @@ def train(
         if is_to_keep_limits(config):
             certify_finished(run, config, length, stopped_by=stopped_by, again=again, say=say)
     return run
+
+
+_TRAINED: dict[Path, Run] = {}  # folder -> the run that this process trains there
+
+
+@contextmanager
+def _alone(run: Run) -> Iterator[None]:
+    """Refuse to train in a folder twice at a time; the lock of a folder is that of a process."""
+    place = run.directory.resolve()
+    if _TRAINED.setdefault(place, run) is not run:
+        raise RunInUseError(f"{run.directory} is being trained by this process already.")
+    try:
+        yield
+    finally:
+        del _TRAINED[place]
 
 
 def complete(config: DictConfig, run: Run) -> None:

@@ -21,6 +21,7 @@ import safe_rl
 from safe_rl.cli.composing import compose_run, overrides_of
 from safe_rl.envs import ConfigError
 from safe_rl.reporting.archive import archive_runs, find_runs
+from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 
@@ -129,6 +130,7 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
         ({"cost_limits": {"cost_hazard": 1}}, "cost_hazards"),
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
         ({"import": ["json"]}, "in Python imports=… names the modules"),
+        ({"note": r"price \${5}", "frames": 40, **SMALL}, r"has '\$\{' .*no run could be opened"),
         ({"callbacks": 3}, "callbacks must be a list of functions"),
         ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
     ],
@@ -261,6 +263,11 @@ def test_folders_in_the_home_are_found_however_they_are_named(run, tmp_path, mon
     again = safe_rl.load(".")
     monkeypatch.chdir(tmp_path)
     assert again.policy is not None
+    monkeypatch.chdir(run.directory)
+    (file,) = Path("checkpoints/last").glob("*")
+    again = safe_rl.load(".", checkpoint=str(file))
+    monkeypatch.chdir(tmp_path)
+    assert again.policy is not None
     page = safe_rl.report(run.directory, out="~/page", archive="~/kept")
     assert {page.parent, Path("~/kept").expanduser()} <= {*run.directory.parent.iterdir()}
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -355,3 +362,10 @@ def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
     assert seen == run.table["steps"] == [40, 80]
     run = safe_rl.resume(tmp_path, frames=400, callbacks=[lambda row: row["steps"] < 120])
     assert run.table["steps"] == [40, 80, 120]
+
+    def again(row):
+        safe_rl.resume(tmp_path, frames=800)
+
+    with pytest.raises(RunInUseError, match="is being trained by this process already"):
+        safe_rl.resume(tmp_path, frames=400, callbacks=[again])
+    assert safe_rl.resume(tmp_path, frames=200).table["steps"][-1] == 200

@@ -7,7 +7,7 @@ from commands import composed
 from omegaconf import OmegaConf
 from run_configs import point_mass_config
 
-from safe_rl.cli.composing import read_resumed, refuse_changes
+from safe_rl.cli.composing import overrides_of, read_resumed, refuse_changes
 from safe_rl.cli.config import check_settings
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
@@ -77,6 +77,11 @@ def test_what_is_marked_may_change(run, key, value):
 
 def test_another_logger_leaves_no_keys_of_the_first(run):
     assert resumed(run, "logger=none").logger == {"_target_": None}
+    config = OmegaConf.load(run / "config.yaml")
+    config.logger = {"_target_": "safe_rl.runs.loggers.WandbLogger", "project": "mine"}
+    OmegaConf.save(config, run / "config.yaml")
+    for word in ("logger=none", *overrides_of({"logger": "none"})):  # on a command line, in Python
+        assert "project" not in read_resumed(run, None, [word]).get("logger", {})
 
 
 def test_only_a_run_can_be_resumed(run):

@@ -5,6 +5,7 @@ import yaml
 
 from safe_rl.cli.report import ReportOptions, report
 from safe_rl.evaluation.loading import robot_of
+from safe_rl.evaluation.policies import pack_policy
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import lock_folder
 from safe_rl.runs.loggers import TensorboardLogger
@@ -45,6 +46,8 @@ def test_a_folder_with_links_is_not_written_to(place, tmp_path):
     (run / place).symlink_to(mine)
     with pytest.raises(ValueError, match=rf"{place} is a link"), lock_folder(Run(run).lock_file):
         pass
+    with pytest.raises(ValueError, match=rf"{place} is a link"):  # nor given away
+        pack_policy(run, tmp_path / "exported")
     assert listing(mine) == ["00000000.pt"]
 
 

@@ -53,6 +53,7 @@ def test_folders_of_a_sweep_name_all_but_the_machine_and_what_is_in_the_path(all
     [
         ("policy_update.adapt_rate.factor", Role.LEARNING),
         ("policy_update._target_", Role.EXPERIMENT),
+        ("policy_update.rates.log_alpha", Role.EXPERIMENT),  # the optimiser's, which is restored
         ("loss.gamma", Role.LEARNING),
         ("loss.alpha_init", Role.EXPERIMENT),
         ("logger._target_", Role.MACHINE),
