@@ -110,6 +110,11 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
             f"env.id={node['id']}: a configuration cannot import a module. If you trust "
             f"'{module}', use {quote(f'import={module}')} {quote(f'env.id={plain}')}"
         )
+    if plain.startswith("GymV"):  # of OpenAI's gym, which imports the module in the argument env_id
+        raise ConfigError(
+            f"env.id={node['id']}: it imports what its arguments name. Make the environment in a "
+            "module of yours, and register it with Gymnasium: import=my_module"
+        )
     full = {"name": node["id"], **node}
     for key, row in family.keys.items():
         checked(key, row.annotation, full.setdefault(key, row.default))

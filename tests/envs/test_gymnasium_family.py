@@ -57,6 +57,7 @@ def test_seeds_determine_rows_and_share_none(node):
         ({"id": None}, r"env\.id="),
         ({"id": "Wolk-v0"}, "Did you mean 'Walk-v0'.*import=my_module"),
         ({"id": "os.path:Walk-v0"}, "import=os.path env.id=Walk-v0"),
+        ({"id": "GymV26Environment-v0", "kwargs": {"env_id": "os.path:W-v0"}}, "imports what its"),
         ({"border": 3}, "no key 'border'.*env.kwargs"),
         ({"num_steps": 0}, "num_steps=0: it must be greater"),
         ({"kwargs": {"speed": 3}}, "Walk-v0.*speed"),
