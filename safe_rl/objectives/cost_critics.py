@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import torch
 from pydantic import FiniteFloat
-from tensordict import NestedKey, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -107,7 +107,7 @@ class CostCritics(QFunctionLoss):
 
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
-        following = (("next", key) for key in (*self._read, *self.cost_keys))
+        following = (unravel_key(("next", key)) for key in (*self._read, *self.cost_keys))
         self._in_keys = list(dict.fromkeys([*self._in_keys, *self._read, *following]))
 
     def values_of_costs(

@@ -95,8 +95,8 @@ class QFunctionLoss(ReplayLoss):
     def _set_in_keys(self) -> None:
         super()._set_in_keys()
         # TorchRL's losses name only what the actor reads in the next state
-        following = [unravel_key(("next", key)) for key in self.qvalue_network.in_keys[:-1]]
-        self._in_keys = list(dict.fromkeys([*self._in_keys, *following]))
+        following = [("next", key) for key in self.qvalue_network.in_keys[:-1]]
+        self._in_keys = list(dict.fromkeys(map(unravel_key, [*self._in_keys, *following])))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -13,6 +13,7 @@ from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.models import make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import (
+    LagrangeMultiplier,
     SACLagrangianLoss,
     TD3Loss,
 )
@@ -205,6 +206,16 @@ def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)
     with pytest.raises(ValueError, match="another order"):
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=COSTS[::-1], **SAC)
+
+
+def test_the_names_of_nested_entries_are_as_a_batch_has_them():
+    keys = [("info", "cost"), "cost_other"]
+    multiplier = LagrangeMultiplier(dict.fromkeys(keys, 1.0), init=1.0, lr=0.1)
+    networks = make_squashed_actor(3, *BOUNDS, hidden_sizes=[8]), make_q()
+    cost_q = make_q(2, num_outputs=2, out_key="cost_value")
+    loss = SACLagrangianLoss(*networks, cost_q, multiplier=multiplier, cost_keys=keys, **SAC)
+    loss.set_keys(reward=("info", "reward"))
+    assert {("next", "info", "cost"), ("next", "info", "reward")} <= {*loss.in_keys}
 
 
 def test_a_minibatch_that_fails_leaves_the_policy_its_parameters():
