@@ -247,7 +247,8 @@ class Run(RecordedRun):
     def __init__(self, directory: Path | str, checkpoint: str = "last") -> None:
         # they are read later, perhaps from another working directory
         super().__init__(Path(directory).absolute())
-        self.checkpoint = checkpoint if checkpoint in KINDS else str(Path(checkpoint).absolute())
+        is_file = checkpoint not in KINDS and Path(checkpoint).exists()
+        self.checkpoint = str(Path(checkpoint).absolute()) if is_file else checkpoint
 
     @cached_property
     def env(self) -> EnvBase:
