@@ -100,14 +100,11 @@ class Multiplier(Checked, nn.Module, ABC):
         multiplier of this cost and its state do not change.
 
         Raises:
-            ValueError: If there is not one limit per cost, costs are in another order, or λ falls
-                below 0.
+            ValueError: If there is not one limit per cost, in its order, or λ falls below 0.
         """
         if state.violation.shape != (self.num_costs,):
-            raise ValueError(
-                f"update() needs one violation for each of {self.cost_keys}, "
-                f"got shape {tuple(state.violation.shape)}."
-            )
+            shape = tuple(state.violation.shape)
+            raise ValueError(f"One violation for each of {self.cost_keys}, got the shape {shape}.")
         check_order(state.keys, self.cost_keys)
         state = state.to(self.limits)
         known = state.violation.isfinite() & state.is_new
@@ -115,10 +112,8 @@ class Multiplier(Checked, nn.Module, ABC):
             buffer = self.get_buffer(name)
             buffer.copy_(torch.where(known, new, buffer))
         if (self.value < 0).any():
-            raise ValueError(
-                f"{type(self).__name__}: λ must not be below 0, where costs would be rewarded; got "
-                f"{self.value.tolist()}."
-            )
+            name, value = type(self).__name__, self.value.tolist()
+            raise ValueError(f"{name}: λ must not be below 0, which rewards costs; got {value}.")
 
     @abstractmethod
     def _step(self, state: LimitState) -> dict[str, Tensor]:
