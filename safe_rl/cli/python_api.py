@@ -177,7 +177,7 @@ def evaluate(run: Run | str | Path, **options: Any) -> Evaluation:
 
     Examples:
         >>> print(evaluate(getfixture("tiny_run"), episodes=2))  # doctest: +ELLIPSIS
-        ppo_lagrangian on PointGoal1 at 80 steps: 2 episodes with sampled actions, ...
+        ppo_lagrangian on PointGoal1, checkpoint last at 80 steps: 2 episodes with ...
     """
     return (run if isinstance(run, Run) else load(run)).evaluate(**options)
 
