@@ -267,14 +267,14 @@ class LimitTracker(Checked, Resumable):
 
     @property
     def schedule(self) -> str:
-        """A sentence: until when costs have no effect, when the limits fall, and when they hold."""
+        """A sentence: until when limits are above the costs, when they fall, and when they hold."""
         end = self.free_steps + self.descent_steps
         if not end:
             return ""
-        free = (
-            f"Costs are ignored until step {self.free_steps:,}; the " if self.free_steps else "The "
-        )
-        line = f"{free}limits fall until step {end:,} and are constant from there."
+        line = f"fall until step {end:,} and are constant from there."
+        if self.free_steps:
+            line = f"are above the present costs until step {self.free_steps:,}, {line}"
+        line = f"The limits {line}"
         if self._is_shortened:
             line += " (limits.free_steps and limits.descent_steps are shortened to fit frames=…)"
         return line

@@ -123,8 +123,8 @@ def complete_slates(
     """Slates that one algorithm or more has complete, and the environments that all share.
 
     Yields the name of a slate, and for each algorithm with at least ``needed`` finished runs per
-    environment its experiments, one per environment. Only plain experiments count, with a limit on
-    the mean ``cost`` that the published PPO, which is the unit of the violation, does not keep.
+    environment its experiments, one per environment. Only plain experiments count, whose limit is
+    on the mean ``cost`` and below the published cost of PPO: the difference is the unit.
     """
     by_algorithm: dict[str, dict[str, Experiment]] = {}
     for e in experiments:
