@@ -100,14 +100,23 @@ class ReplayUpdate(Checked):
             raise ValueError(f"tau={tau}: {type(loss).__name__} has {advice}.")
         # SoftUpdate equates the targets; its own steps are slow
         self._share = 0.0 if tau is None else 1 - SoftUpdate(loss, tau=tau).eps
-        self._targets = [target.data for target, _ in pairs]
-        self._sources = [source.data for _, source in pairs]
+        self._pair_targets()
         # optimisers without this setting may count their steps in Python
         is_capturable = "capturable" in self.optimizer.defaults
         self._uses_graphs = cuda_graph and is_capturable and self._device.type == "cuda"
         self._reported: dict[bool, Collection[str]] = {}
         self._prepare_steps()
         self._counts = {"updates": 0, "owed": 0.0}
+
+    def _pair_targets(self) -> None:
+        """List the data of target networks, and of the networks that they follow."""
+        pairs = self.loss.target_pairs()
+        self._targets = [target.data for target, _ in pairs]
+        self._sources = [source.data for _, source in pairs]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._pair_targets()  # copies of the data would be apart from the copied networks
 
     def _prepare_steps(self) -> None:
         """Make the functions of a minibatch that take a step, with and without the actor."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
-from typing import Any
+from functools import partial
+from typing import Any, Self
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
@@ -97,8 +99,18 @@ class SharesTensors(LossModule):
 
     A loss of TorchRL stores the parameters and buffers of its networks separately. When it is
     built, loss and networks share them. After ``copy.deepcopy`` they do not: training the copy
-    would not change its networks. After a move, the networks would have their old buffers.
+    would not change its networks, and an optimiser copied with it would not change either. After a
+    move, the networks would have their old buffers.
     """
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        for module in self.children():
+            if isinstance(module, TensorDictParams):  # by itself it ignores what is copied already
+                tensors = module.apply(partial(copy.deepcopy, memo=memo), filter_empty=False)
+                memo[id(module)] = TensorDictParams(tensors, no_convert=True)
+        new = memo[id(self)] = type(self).__new__(type(self))
+        new.__setstate__(copy.deepcopy(vars(self), memo))
+        return new
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         moved = super()._apply(*args, **kwargs)
