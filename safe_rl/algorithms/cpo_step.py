@@ -13,7 +13,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, require_limits
+from safe_rl.algorithms.trust_region_step import (
+    Loss,
+    Proposal,
+    TRPOStep,
+    cost_surrogates,
+    require_limits,
+)
 from safe_rl.objectives.cpo_dual import DualSolution, solve_dual
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.trust_region import FisherProduct, flat_gradient
@@ -103,7 +109,7 @@ class CPOStep(TRPOStep):
         self, losses: TensorDictBase, limits: LimitState
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Gradients of the loss, [P], and of the surrogates, [k, P], and the violations c, [k]."""
-        surrogates = losses["cost_surrogate"]
+        surrogates = cost_surrogates(losses)
         # b is the gradient of an average per time step, so c has to be one too
         c = limits.required_decrease_for(surrogates) / limits.length_for(surrogates)
         g = flat_gradient(finite_sum(losses), self.parameters, retain_graph=True)

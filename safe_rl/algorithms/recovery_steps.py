@@ -10,7 +10,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from safe_rl.algorithms.losses import finite_sum
-from safe_rl.algorithms.trust_region_step import Loss, Proposal, TRPOStep, require_limits
+from safe_rl.algorithms.trust_region_step import (
+    Loss,
+    Proposal,
+    TRPOStep,
+    cost_surrogates,
+    require_limits,
+)
 from safe_rl.checks import Fraction
 from safe_rl.objectives.limits import LimitState
 from safe_rl.objectives.multipliers import CostLimits, parse_cost_limits
@@ -82,7 +88,7 @@ class CTRPOStep(TRPOStep):
         **settings: Any,
     ) -> None:
         super().__init__(loss, **settings)
-        self.limits = parse_cost_limits(cost_limits)[1]
+        self.cost_keys, self.limits = parse_cost_limits(cost_limits)
         self.beta = beta
         self.recovered = -(1 - hysteresis) * self.limits
         self.recovering = torch.zeros_like(self.limits, dtype=torch.bool)
@@ -90,7 +96,8 @@ class CTRPOStep(TRPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        surrogates, state = losses["cost_surrogate"], require_limits(limits)
+        surrogates, state = cost_surrogates(losses), require_limits(limits)
+        state.check(self.cost_keys)
         length = state.length_for(surrogates)
         violation = state.required_decrease_for(surrogates)
         is_above = violation >= self.recovered.to(violation)
@@ -154,7 +161,7 @@ class CRPOStep(TRPOStep):
     def _propose(
         self, losses: TensorDictBase, fisher: FisherProduct, limits: LimitState | None
     ) -> Proposal:
-        decrease = require_limits(limits).required_decrease_for(losses["cost_surrogate"])
+        decrease = require_limits(limits).required_decrease_for(cost_surrogates(losses))
         worst = int(decrease.argmax())
         is_above = decrease[worst] > self.tolerance
         reduces = torch.zeros_like(decrease)

@@ -43,6 +43,16 @@ def require_limits(limits: LimitState | None) -> LimitState:
     return limits
 
 
+def cost_surrogates(losses: TensorDictBase) -> Tensor:
+    """The surrogates of the costs, [k], which constrained steps need."""
+    if losses.get("cost_surrogate", None) is None:
+        raise ValueError(
+            f"A constrained step needs a loss that returns 'cost_surrogate', such as CPOLoss; this "
+            f"one returns {sorted(losses.keys())}."
+        )
+    return losses["cost_surrogate"]
+
+
 class Proposal(NamedTuple):
     """A full step, and the conditions under which a line search may take it."""
 

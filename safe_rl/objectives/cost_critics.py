@@ -133,6 +133,7 @@ class CostCritics(QFunctionLoss):
 
     def prepare(self, batch: TensorDictBase, limits: LimitState) -> None:
         """Update the size u of one cost, and the deviation r of rewards with those of new steps."""
+        limits.check(self.cost_keys)
         self.cost_unit.copy_(limits.unit)
         mask = sample_mask(batch, self)
         rewards = batch.get(("next", self.tensor_keys.reward)).detach()

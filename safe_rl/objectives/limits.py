@@ -132,6 +132,13 @@ class LimitState:
             )
         return self.length.to(surrogates)
 
+    def check(self, costs: Sequence[NestedKey]) -> None:
+        """Raise a ValueError if this is not the state of one limit per cost, in their order."""
+        if self.violation.shape != (len(costs),):
+            shape = tuple(self.violation.shape)
+            raise ValueError(f"One limit for each of {[*costs]}, got a state of the shape {shape}.")
+        check_order(self.keys, costs)
+
     def to(self, like: Tensor) -> LimitState:
         """The same with the dtype and device of a tensor."""
         tensors: Any = {k: v.to(like) for k, v in vars(self).items() if isinstance(v, Tensor)}

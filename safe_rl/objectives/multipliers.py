@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from safe_rl.checks import Checked, Weight, check_value
-from safe_rl.objectives.limits import LimitState, check_order
+from safe_rl.objectives.limits import LimitState
 
 CostLimits = Mapping[NestedKey, float] | Sequence[float] | float
 AboveZero = Annotated[float, Interval(gt=0, le=1e6)]
@@ -100,12 +100,15 @@ class Multiplier(Checked, nn.Module, ABC):
         multiplier of this cost and its state do not change.
 
         Raises:
+            TypeError: If it is no `LimitState`.
             ValueError: If there is not one limit per cost, in its order, or λ falls below 0.
         """
-        if state.violation.shape != (self.num_costs,):
-            shape = tuple(state.violation.shape)
-            raise ValueError(f"One violation for each of {self.cost_keys}, got the shape {shape}.")
-        check_order(state.keys, self.cost_keys)
+        if not isinstance(state, LimitState):
+            raise TypeError(
+                f"update takes a LimitState, got a {type(state).__name__}: what Constraints.update "
+                "returns, or LimitState.of(cost=[30.0], limit=[25.0])."
+            )
+        state.check(self.cost_keys)
         state = state.to(self.limits)
         known = state.violation.isfinite() & state.is_new
         for name, new in self._step(state).items():

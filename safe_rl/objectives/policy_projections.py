@@ -110,10 +110,16 @@ class CUPLoss(WeighsCosts):
     """
 
     extra_out_keys = ("cost_surrogate",)
+    _behaviour_hint = "CUPLoss.prepare(batch, limits) writes it: call it after the first update."
 
     def __init__(self, *parts: Any, gamma: Weight, lmbda: Share, **settings: Any) -> None:
         super().__init__(*parts, **settings)
         self.cost_factor = (1 - gamma * lmbda) / (1 - gamma)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries of the batch that are read; the advantage of the reward is not."""
+        return [key for key in super().in_keys if key != self.tensor_keys.advantage]
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:

@@ -109,7 +109,7 @@ class SharesTensors(LossModule):
                 tensors = module.apply(partial(copy.deepcopy, memo=memo), filter_empty=False)
                 memo[id(module)] = TensorDictParams(tensors, no_convert=True)
         new = memo[id(self)] = type(self).__new__(type(self))
-        new.__setstate__(copy.deepcopy(vars(self), memo))
+        new.__setstate__(copy.deepcopy(self.__dict__, memo))
         return new
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:

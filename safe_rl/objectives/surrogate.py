@@ -72,6 +72,7 @@ class SurrogateLoss(Checked, SharesTensors):
 
     limits: LimitState | None = None
 
+    _behaviour_hint = "It is the behaviour policy's, stored when the action was sampled."
     #: Entries of the batch that a subclass reads besides those of `in_keys`.
     extra_in_keys: tuple[NestedKey, ...] = ()
     #: Entries besides ``loss_objective`` that a subclass adds.
@@ -204,9 +205,11 @@ class SurrogateLoss(Checked, SharesTensors):
         self, tensordict: TensorDictBase, distribution: Distribution, log_weight: Tensor
     ) -> Tensor:
         """KL(π_θ ‖ π_k) per state, [...]."""
-        hint = "It is the behaviour policy's, stored when the action was sampled."
-        keys = self.behaviour_keys.items()
-        stored = TensorDict({key: require(tensordict, place, hint) for key, place in keys})
+        entries = {
+            key: require(tensordict, place, self._behaviour_hint)
+            for key, place in self.behaviour_keys.items()
+        }
+        stored = TensorDict(entries)
         behaviour = self.actor_network.build_dist_from_params(stored)
         return kl(distribution, behaviour, log_weight.squeeze(-1))
 
@@ -274,6 +277,12 @@ class WeighsCosts(SurrogateLoss):
                 f"{multiplier!r}: without constraints use PPOLoss or TRPOLoss."
             )
         self.multiplier = multiplier
+
+    def prepare(self, batch: TensorDictBase, limits: LimitState | None = None) -> TensorDictBase:
+        """Also refuse a state that is not of the multiplier's costs."""
+        if limits is not None:
+            limits.check(self.multiplier.cost_keys)
+        return super().prepare(batch, limits)
 
     def _cost_advantage(self, tensordict: TensorDictBase) -> Tensor:
         """Cost advantages in units of one cost, A_c / u, [..., k]."""

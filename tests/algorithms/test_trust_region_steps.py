@@ -286,6 +286,9 @@ def test_errors_say_what_to_change():
         step(batch)
     with pytest.raises(ValueError, match="one column per limit"):
         step(batch, limit_state(0.0, 0.0))
+    step = CPOStep(TRPOLoss(actor, entropy_coeff=0.0), **SETTINGS)
+    with pytest.raises(ValueError, match="such as CPOLoss"):
+        step(batch, limit_state(0.0))
 
 
 @pytest.mark.parametrize("entry", ["advantage", "cost_advantage", "observation", "action"])

@@ -124,7 +124,16 @@ def test_both_optimisers_resume():
         assert torch.equal(state[0]["exp_avg"], expected[0]["exp_avg"])
 
 
+def test_the_projection_needs_all_its_inputs_and_no_other_entry():
+    _, batch, loss, _ = moved_case()
+    loss.limits = None
+    torch.testing.assert_close(dict(loss(batch.select(*loss.in_keys))), dict(loss(batch)))
+    for key in loss.in_keys:
+        with pytest.raises(KeyError):
+            loss(batch.exclude(key))
+
+
 def test_a_batch_without_an_anchor_is_refused():
     actor = make_actor()
-    with pytest.raises(KeyError, match="anchor"):
+    with pytest.raises(KeyError, match=r"anchor.*CUPLoss.prepare\(batch, limits\) writes it"):
         cup_loss(actor, 1.0)(make_batch(actor, [8], 1))

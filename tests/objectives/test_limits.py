@@ -261,6 +261,19 @@ def test_costs_in_another_order_than_those_of_the_multiplier_are_refused():
         ProjectedMultiplier({"b": 1.0, "a": 5.0}, init=0.0, lr=0.01, highest=None).update(state)
 
 
+def test_a_state_of_one_limit_is_refused_by_parts_that_have_two():
+    state = LimitState.of(cost=[30.0], limit=[25.0], length=100.0)
+    multiplier = ProjectedMultiplier([25.0, 10.0], init=0.0, lr=0.01, highest=None)
+    actor = make_actor()
+    loss = RCPOLoss(actor, multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
+    batch = make_batch(actor, [8], 2)
+    for use in (multiplier.update, lambda state: loss.prepare(batch, state)):
+        with pytest.raises(ValueError, match=r"One limit for each of \['cost_0', 'cost_1'\]"):
+            use(state)
+    with pytest.raises(TypeError, match=r"got a Tensor.*LimitState.of\(cost="):
+        multiplier.update(state.cost)
+
+
 def test_every_limited_cost_has_to_be_counted():
     batch = TensorDict(next={"cost": torch.ones(1, 5, 1)}, batch_size=[1, 5])
     episodes = EpisodeStatistics(torch.ones(1), {}, torch.ones(1), {})

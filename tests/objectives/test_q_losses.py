@@ -206,6 +206,8 @@ def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)
     with pytest.raises(ValueError, match="another order"):
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=COSTS[::-1], **SAC)
+    with pytest.raises(ValueError, match="One limit for each of"):
+        told(make_loss("sac", multiplier, is_prepared=False), [1.0], rewards=[1.0])
 
 
 def test_the_names_of_nested_entries_are_as_a_batch_has_them():
