@@ -25,7 +25,7 @@ _NAMES: dict[NestedKey, str] = {
     "action": "actions",
     ("next", "reward"): "rewards",
 }
-# names of arrays in files of DSRL (Liu et al. 2024): those of D4RL, and `costs`
+# names of arrays in files of DSRL (Liu et al. 2024): those of D4RL, which have no `costs`
 _FLAT = _NAMES | {
     ("next", "cost"): "costs",
     ("next", "terminated"): "terminals",
@@ -137,6 +137,8 @@ def read_hdf5(path: Path | str) -> TensorDict:
       any ``cost_<kind>``, one per step, or one more with the reset's 0 first. An episode without
       an end in its last step counts as truncated.
 
+    Costs may be missing: algorithms without limits do not read them.
+
     Raises:
         ValueError: If the file is no HDF5 file, or damaged; if an array is missing, or does not
             have one row of numbers for each action; if a flag is neither 0 nor 1.
@@ -240,8 +242,6 @@ def _read_episode(place: str, group: Any) -> Arrays:
             if len(cost) == number + 1 and not cost[:1].any():
                 cost = cost[1:]  # the first is that of the reset
             arrays["next", name] = cost
-    if ("next", "cost") not in arrays:
-        raise ValueError(f"{place} has no infos/cost. What it has: {printable(', '.join(infos))}.")
     _check_shapes(place, arrays)
     arrays["next", "truncated"][-1:] |= ~arrays["next", "terminated"][-1:]
     return arrays
@@ -254,12 +254,12 @@ def _is_array(node: Any) -> bool:
 
 def _arrays(place: Path | str, nodes: Mapping[str, Any], names: Mapping[NestedKey, str]) -> Arrays:
     present = [name for name, node in nodes.items() if _is_array(node)]
-    if missing := sorted(set(names.values()) - set(present)):
+    if missing := sorted(set(names.values()) - {"costs"} - set(present)):
         raise ValueError(
             f"{place} has no {', '.join(missing)}: transitions are read from files like those of "
             f"DSRL or Minari. What it has: {printable(', '.join(present)) or 'nothing'}."
         )
-    arrays = {key: _values(place, nodes[name]) for key, name in names.items()}
+    arrays = {key: _values(place, nodes[name]) for key, name in names.items() if name in present}
     for key in _FLAGS:
         if not np.isin(arrays[key], (0, 1)).all():
             raise ValueError(f"{place}: its {names[key]} must be 0 or 1.")

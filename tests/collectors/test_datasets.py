@@ -212,7 +212,7 @@ def test_what_is_no_dataset_is_refused(tmp_path, h5py):
     [
         ({"actions": np.zeros((4, 2))}, r"observation must be numbers of shape \(4, 3\), as there"),
         ({"rewards": np.float64(1.0)}, "has no rewards"),
-        ({"costs": None}, "has no costs.*What it has: actions"),
+        ({"rewards": None}, "has no rewards.*What it has: actions"),
         ({"actions": np.array([b"left"] * 6)}, "the action must be numbers"),
         ({"costs": np.zeros((6, 2))}, r"the next cost must be numbers of shape \(6,\), as"),
         ({"next_observations": np.zeros((6, 4))}, r"numbers of shape \(6, 3\),.* shape \(6, 4\)"),
@@ -231,6 +231,18 @@ def test_a_file_whose_arrays_do_not_fit_together_is_refused(changes, told, tmp_p
                 file[name] = file[array][:] if isinstance(array, str) else array
     with pytest.raises(ValueError, match=told):
         read_hdf5(path)
+
+
+def test_files_without_costs_can_be_read(tmp_path, h5py):
+    """Algorithms without limits need none; others say that it has no cost."""
+    write_hdf5(h5py, tmp_path / "flat.hdf5", leave_out=["costs"])
+    write_minari(h5py, tmp_path / "episodes.hdf5")
+    with h5py.File(tmp_path / "episodes.hdf5", "a") as file:
+        for episode in file.values():
+            del episode["infos"]
+    for name in ("flat", "episodes"):
+        found = set(read_hdf5(tmp_path / f"{name}.hdf5")["next"].keys())
+        assert found == {"observation", "reward", "done", "terminated", "truncated"}
 
 
 def test_an_array_made_by_a_shift_has_no_observation_of_another_episode(tmp_path, h5py):
@@ -317,7 +329,7 @@ def test_a_file_with_flipped_bits_is_read_or_refused_in_one_line(tmp_path, h5py)
         ("infos/cost", np.zeros(3), "episode_4: the next cost must be"),
         ("infos/cost", np.ones(2), "episode_4: the next cost must be"),
         ("infos/cost_hazards", None, "episode_4 has other costs than episode_0"),
-        ("infos/cost", "group", "no infos/cost"),
+        ("infos/cost", "group", "episode_4 has other costs than episode_0"),
     ],
 )
 def test_an_episode_that_does_not_fit_is_named(name, array, told, tmp_path, h5py):
