@@ -153,8 +153,9 @@ def test_observed_choices_that_begin_at_another_number_are_refused_unless_flatte
 
     make = functools.partial(from_gymnasium, FromOne, num_envs=1, num_steps=3, seed=0)
     assert make().rollout(1)["observation"][0, 0].tolist() == [0.0, 0.0, 1.0]
-    with pytest.raises(ConfigError, match=r"Discrete\(3, start=1\) is observed: set flatten=true"):
-        make(flatten=False)
+    for keys in ({"flatten": False}, {"privileged": "n"}):
+        with pytest.raises(ConfigError, match=r"start=1\) is observed: let it begin at 0, or set"):
+            make(**keys)
 
 
 def test_a_sum_of_costs_in_info_is_the_cost_and_no_kind_of_its_own():
@@ -240,6 +241,7 @@ def test_a_new_environment_can_be_copied():
         ("Pendulum-v1", {}, r"reports no costs.*name it in 'cost_keys'"),
         (acting(Box(-np.inf, np.inf, (1,))), {}, r"or choices \(Discrete.*, got Unbounded"),
         (acting(Box(0.0, np.inf, (2,))), {}, r"finite bounds.* \[0.0, 0.0\] and \[inf, inf\]"),
+        (Counter(), {}, r"'env' must be an id or a function.* give its class, or a function"),
         (Counter, {"num_steps": None}, "give 'num_steps'"),
         (Counter, {"num_envs": 0}, "num_envs=0: it must be greater than or equal to 1"),
         (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*need flatten=False"),

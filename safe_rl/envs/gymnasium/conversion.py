@@ -88,6 +88,11 @@ def from_gymnasium(
         checked("num_steps", Count, num_steps)
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
+    if not (isinstance(env, str) or callable(env)):
+        raise ConfigError(
+            f"'env' must be an id or a function that makes an environment, got {env}: several are "
+            "made, so give its class, or a function such as lambda: MyEnv(…)."
+        )
     config = {"cost_keys": cost_keys, "num_steps": num_steps, "outside": outside}
     config |= {"flatten": flatten, "privileged": privileged, "kwargs": kwargs, "render_mode": None}
     node = {"id": env, **config}

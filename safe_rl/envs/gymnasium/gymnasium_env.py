@@ -58,7 +58,9 @@ def make_adapted(
             "the names of nested entries."
         )
     elif shifted := [x for x in (seen, *entries.values()) if np.any(getattr(x, "start", 0))]:
-        raise ConfigError(f"{shifted[0]} is observed: set flatten=true, or let it begin at 0.")
+        raise ConfigError(
+            f"{shifted[0]} is observed: let it begin at 0, or set flatten=true without privileged."
+        )
     if isinstance(actions, Discrete | MultiDiscrete) and np.any(actions.start):
         choices = (
             Discrete(actions.n) if isinstance(actions, Discrete) else MultiDiscrete(actions.nvec)
