@@ -56,12 +56,14 @@ class Charged(Runner):
 
 
 class Ends(EnvBase):
-    """One that ends after two steps, and says `done` alone."""
+    """One that ends after two steps, says it by one flag alone, and has rewards of integers."""
 
-    def __init__(self):
+    def __init__(self, flag="done", silent=False):
         super().__init__()
+        self._flag, self._silent = flag, silent
         self.observation_spec = Composite(place=Unbounded(1), cost_effort=Unbounded(1))
-        self.action_spec, self.reward_spec = Bounded(0.0, 1.0, (1,)), Unbounded(1)
+        self.action_spec = Bounded(0.0, 1.0, (1,))
+        self.reward_spec = Unbounded(1, dtype=torch.int64)
 
     def _reset(self, tensordict=None, **_):
         self._place = torch.zeros(1)
@@ -69,8 +71,10 @@ class Ends(EnvBase):
 
     def _step(self, tensordict):
         self._place = self._place + 1
-        step = {"place": self._place, "cost_effort": torch.ones(1)}
-        return TensorDict(step).update({"reward": torch.ones(1), "done": self._place >= 2})
+        step = TensorDict(place=self._place, reward=torch.ones(1, dtype=torch.int64))
+        if not (self._silent and self._place >= 2):
+            step["cost_effort"] = torch.ones(1)
+        return step.set(self._flag, self._place >= 2)
 
     def _set_seed(self, seed): ...
 

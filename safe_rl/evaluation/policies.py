@@ -156,7 +156,8 @@ def export_onnx(
         policy = make_behaviour(policy)
     if len(policy.in_keys) != 1:
         raise ValueError(f"Policies that read {policy.in_keys} cannot be exported, only vectors.")
-    if sampled and not isinstance(policy, BehaviourPolicy | ExploringPolicy):
+    is_plain = isinstance(policy, BehaviourPolicy | ExploringPolicy) and policy.network is not None
+    if sampled and not is_plain:
         raise ValueError(
             "The samples of this policy's distribution cannot be drawn in an ONNX graph. Export "
             "the mean of its actions, actions=mean; a certificate of sampled actions does not "

@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.modules import ConvNet, GRUModule, set_recurrent_mode
 
 from safe_rl.models.heads import AUTO, Head, make_head
@@ -33,7 +33,7 @@ class Entry(NamedTuple):
     key: NestedKey
     name: str  # of the component; "observation" if the observation is not nested
     shape: tuple[int, ...]  # of one environment: [n], [height, width, colours] or colours first
-    is_bytes: bool  # whether the numbers are integers from 0 to 255
+    highest: float  # the largest number of a picture of integers, 255 at most; else 1
 
     def __str__(self) -> str:
         return f"{self.name} {list(self.shape)}"
@@ -62,13 +62,14 @@ def observed_entries(spec: Composite, names: Sequence[str] = ("observation",)) -
 
 
 def _entry(key: NestedKey, name: str, spec: TensorSpec) -> Entry:
-    shape = tuple(spec.shape[1:])
-    if len(shape) not in (1, 3):
+    if len(shape := tuple(spec.shape[1:])) not in (1, 3):
         raise ValueError(
             f"The observation '{name}' of an environment has the shape {list(shape)}, but networks "
             "take vectors [n] and pictures [height, width, colours]."
         )
-    return Entry(key, name, shape, not spec.dtype.is_floating_point)
+    most = float(spec.high.max()) if isinstance(spec, Bounded) else 255.0
+    is_of_integers = not (spec.dtype.is_floating_point or spec.dtype == torch.bool)
+    return Entry(key, name, shape, min(max(most, 1.0), 255.0) if is_of_integers else 1.0)
 
 
 class Observed(NamedTuple):
@@ -168,11 +169,11 @@ class Body(Codes):
 
 
 class Pixels(nn.Module):
-    """Converts pictures with colours last or first, in bytes or [0, 1], for convolutions."""
+    """Converts pictures with colours last or first, in [0, highest], for convolutions."""
 
-    def __init__(self, colours_last: bool, is_bytes: bool) -> None:
+    def __init__(self, colours_last: bool, highest: float) -> None:
         super().__init__()
-        self._colours_last, self._factor = colours_last, 1 / 255 if is_bytes else 1.0
+        self._colours_last, self._factor = colours_last, 1 / highest
 
     def forward(self, picture: Tensor) -> Tensor:
         """[..., height, width, colours] -> [..., colours, height, width], float."""
@@ -197,8 +198,9 @@ def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> n
     assert observed.encoders is not None
     names = ("channels", "kernels", "strides")
     channels, kernels, strides = (list(observed.encoders[name]) for name in names)
-    # at most three colours and a depth; if both ends are that short, colours are last
-    colours_last = entry.shape[-1] <= 4
+    first, middle, last = entry.shape
+    # colours are the shorter end, or the last one with at most three colours and a depth
+    colours_last = last <= 4 or (middle != last and (first == middle or last < first))
     colours = entry.shape[-1] if colours_last else entry.shape[0]
     convolutions = ConvNet(
         in_features=colours,
@@ -208,7 +210,7 @@ def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> n
         activation_class=nn.ReLU,
         device=device,
     )
-    network = nn.Sequential(Pixels(colours_last, entry.is_bytes), convolutions)
+    network = nn.Sequential(Pixels(colours_last, entry.highest), convolutions)
     try:
         network(_blank(entry, device))
     except RuntimeError as error:

@@ -7,11 +7,12 @@ import math
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
-from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import IndependentNormal
 
 from safe_rl.models.networks import Chain
+from safe_rl.models.replay_networks import SquashedNormal
 from safe_rl.naming import STEPS_TAKEN
 
 
@@ -72,10 +73,11 @@ class ExploringPolicy(TensorDictModuleBase):
     It shares the actor's parameters and writes only the action, without distribution objects. It
     samples from a squashed Gaussian actor, and adds Gaussian noise to the actions of a
     deterministic one. Under ``set_exploration_type`` with ``DETERMINISTIC``, ``MODE`` or ``MEAN``,
-    the action is that of the deterministic actor, or the tanh of the Gaussian's mean.
+    the action is that of the deterministic actor, or the tanh of the Gaussian's mean. Policies of
+    other distributions or several modules act by themselves, which takes more time.
 
     Args:
-        actor: A policy made by `safe_rl.models.make_squashed_actor` or
+        actor: A policy, such as of `safe_rl.models.make_squashed_actor` or
             `safe_rl.models.make_bounded_actor`.
         low: Lower bounds of the action, [A].
         high: Upper bounds of the action, [A].
@@ -110,27 +112,37 @@ class ExploringPolicy(TensorDictModuleBase):
         super().__init__()
         self.samples = isinstance(actor, ProbabilisticTensorDictSequential)
         network, sampler = (actor.module[0], actor.module[-1]) if self.samples else (actor, actor)
-        self.network, self.noise = network.module, noise
+        is_known = not self.samples or (
+            len(actor.module) == 2 and sampler.distribution_class is SquashedNormal
+        )
+        is_plain = is_known and not isinstance(network.module, nn.ModuleList)
+        self.network: nn.Module | None = network.module if is_plain else None
+        self.actor, self.noise = None if is_plain else actor, noise
+        self.in_keys = list(network.in_keys if is_plain else actor.in_keys)
         # of a sampler, the log-probability comes second
-        self.in_keys, self.out_keys = list(network.in_keys), list(sampler.out_keys[:1])
+        self.out_keys = ["action"] if "action" in actor.out_keys else list(sampler.out_keys[:1])
         device = next(actor.parameters()).device
         for name, value in (("low", low), ("high", high), ("is_random", torch.tensor(False))):
             self.register_buffer(name, value.to(device), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        outputs = self.network(*map(tensordict.get, self.in_keys))
         is_noisy = exploration_type() not in WITHOUT_NOISE
         half = (self.high - self.low) / 2
-        if self.samples:
-            loc, scale = outputs
+        if self.network is None:
+            assert self.actor is not None
+            # its own default may be to act without noise
+            with set_exploration_type(exploration_type() or ExplorationType.RANDOM):
+                action = self.actor(tensordict.select(*self.in_keys)).get(self.out_keys[0])
+        elif self.samples:
+            loc, scale = self.network(*map(tensordict.get, self.in_keys))
             inner = torch.addcmul(loc, scale, torch.randn_like(loc)) if is_noisy else loc
             action = self.low + half * (1 + inner.tanh())
-        elif is_noisy and self.noise:
-            action = outputs + self.noise * half * torch.randn_like(outputs)
-            action = action.clamp(self.low, self.high)
         else:
-            action = outputs
+            action = self.network(*map(tensordict.get, self.in_keys))
+        if is_noisy and self.noise and not self.samples:
+            action = action + self.noise * half * torch.randn_like(action)
+            action = action.clamp(self.low, self.high)
         if is_noisy:
             uniform = self.low + 2 * half * torch.rand_like(action)
             action = torch.where(self.is_random, uniform, action)
@@ -146,7 +158,7 @@ class HeldActions(TensorDictModuleBase):
     environment writes `is_init`.
 
     Args:
-        policy: The policy that decides; it is not recurrent.
+        policy: The policy that decides; the state of a recurrent one is held, too.
         k: Steps for which an action is held.
 
     Examples:
@@ -162,9 +174,10 @@ class HeldActions(TensorDictModuleBase):
     def __init__(self, policy: TensorDictModuleBase, k: int) -> None:
         super().__init__()
         self.policy, self.k = policy, k
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        states = [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *states]
         self._taken: Tensor | None = None  # steps of the present decisions, [N]
-        self._held: Tensor | None = None
+        self._held: TensorDictBase | None = None
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Decide anew at the next step, in all rows or in those of a mask, bool [N]."""
@@ -185,10 +198,9 @@ class HeldActions(TensorDictModuleBase):
             self.reset(begins)
         decides = self._taken % self.k == 0
         if decides.any():
-            chosen = self.policy(tensordict.select(*self.in_keys)).get("action")
-            where = decides.reshape(*shape, *[1] * (chosen.ndim - len(shape)))
+            chosen = self.policy(tensordict.select(*self.in_keys)).select(*self.out_keys)
             if self._held is not None and not decides.all():
-                chosen = torch.where(where, chosen, self._held)
+                chosen = torch.where(decides, chosen, self._held)
             self._held = chosen
         self._taken = self._taken + 1
-        return tensordict.set("action", self._held)
+        return tensordict.update(self._held)

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 from point_mass import PointMass
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import ActionScaling, Compose, TransformedEnv
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
 from safe_rl.envs import make_env
@@ -59,6 +59,27 @@ def test_a_delay_shifts_actions_and_nothing_else(env):
     plain, late = play(ENVIRONMENTS[env](), early), play(transformed(env, "delay"), actions)
     assert torch.equal(late["next", "observation"], plain["next", "observation"])
     assert torch.equal(late["action"], actions)  # what is learned from
+
+
+def test_a_delay_inside_other_units_begins_with_what_the_environment_takes_for_nothing():
+    units = ActionScaling(loc=-3.0, scale=1.0)  # policies act in [2, 4]
+    env = transformed(PointMass(1), delay=ActionDelay(1), units=units)
+    state = env.step(env.reset().set("action", torch.full((1, 2), 4.0)))
+    assert (state["next", "observation"][:, 2:4] == 0).all()
+
+
+def test_a_filter_may_work_in_place_on_what_it_gets():
+    def shield(step):
+        step["observation"].zero_()
+        return step["action"]
+
+    plain, filtered = PointMass(2), transformed(PointMass(2), f=ActionFilter(shield))
+    actions = torch.ones(2, 2)
+    for env in (plain, filtered):
+        env.set_seed(0)
+    before, same = (env.step(env.reset().set("action", actions)) for env in (plain, filtered))
+    assert before["observation"].any()
+    assert torch.equal(same["observation"], before["observation"])
 
 
 def test_what_is_pending_ends_with_the_episode_of_its_row():

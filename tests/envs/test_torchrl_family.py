@@ -161,9 +161,29 @@ def test_what_cannot_be_made_is_said(keys, message):
         make_env({**PENDULUM, **keys})
 
 
-def test_an_end_without_a_reason_is_a_termination(trusted):
-    env = make_env(RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5}, num_envs=2, seed=0)
-    assert env.rollout(5)["next", "terminated"].flatten().tolist() == [False, True] * 2
+@pytest.mark.parametrize("flag", ["done", "terminated"])
+def test_an_end_that_one_flag_tells_is_a_termination(flag, trusted):
+    ends = RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5, "kwargs": {"flag": flag}}
+    env = make_env(ends, num_envs=2, seed=0)
+    steps = env.rollout(6, break_when_any_done=False)["next"]
+    for name in ("done", "terminated"):
+        assert steps[name][0].flatten().tolist() == [False, True] * 3
+
+
+def test_rewards_of_integers_can_be_changed_by_transforms(trusted):
+    node = {"_target_": "safe_rl.envs.transforms.Saute", "budgets": {"cost": 1.5}}
+    node |= {"discount": 1.0, "unsafe_reward": -0.5, "rescale_budgets": False}
+    ends = RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5}
+    env = make_env(ends, num_envs=1, seed=0, transforms={"saute": node})
+    check_env_specs(env)
+    assert env.rollout(2)["next", "reward"].flatten().tolist() == [1.0, -0.5]
+
+
+def test_an_entry_that_a_step_leaves_out_is_not_that_of_an_earlier_step(trusted):
+    ends = RUNNER | {"id": "torchrl_envs.Ends", "kwargs": {"silent": True}}
+    env = make_env(ends, num_envs=2, seed=0)
+    with pytest.raises(ConfigError, match=r"Ends: a step wrote no 'cost_effort'.*in every step"):
+        env.rollout(2)
 
 
 def test_only_what_was_imported_is_reached(trusted):

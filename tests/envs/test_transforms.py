@@ -8,7 +8,15 @@ from point_mass import PointMass
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.envs.utils import check_env_specs
-from transforming import ENVIRONMENTS, SAUTE, TRANSFORMS, Priced, still, transformed
+from transforming import (
+    ENVIRONMENTS,
+    SAUTE,
+    TRANSFORMS,
+    Priced,
+    half_speed,
+    still,
+    transformed,
+)
 
 from safe_rl.envs import ConstrainedEnv, check_constrained_env, make_env
 from safe_rl.envs.transforms import (
@@ -187,8 +195,8 @@ def test_nodes_are_built_and_their_keys_named():
         make_env("PointGoal1", transforms={"n": {"_target_": "transforming.normed"}})
 
 
-def filtered(function):
-    return transformed(PointMass(1), f=ActionFilter(function))
+def filtered(function, **keys):
+    return transformed(PointMass(1), f=ActionFilter(function, **keys))
 
 
 @pytest.mark.parametrize(
@@ -212,6 +220,10 @@ def filtered(function):
             r"'r' has to be the last one.*transforms=\[o,r\]",
         ),
         (lambda: transformed(PointMass(1), o=ObservedCosts(0.5, ["coast"])), "no cost 'coast'"),
+        *(
+            (lambda key=key: filtered(half_speed, cost_key=key), f"f: cost_key={key}: choose anot")
+            for key in ("cost", "cost_north", "reward")
+        ),
         (
             lambda: transformed("dictionary", o=ObservedCosts(0.5)).observation_spec,
             "observed_costs adds columns",

@@ -4,6 +4,7 @@ import gymnasium
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import safe_rl
@@ -79,3 +80,15 @@ def test_in_an_environment_that_holds_actions_it_decides_at_every_call():
     env = make_env("PointGoal1", num_envs=2, seed=0, num_threads=1, transforms=slow)
     actions = env.rollout(3, policy)["action"]
     assert not torch.equal(actions[:, 0], actions[:, 1])
+
+
+def test_the_state_of_a_recurrent_policy_is_held_with_its_action():
+    counting = TensorDictModule(
+        lambda memory: (memory, memory + 1), ["memory"], ["action", ("next", "memory")]
+    )
+    policy, state, taken = HeldActions(counting, k=2), torch.zeros(2, 1), []
+    for _ in range(6):
+        step = policy(TensorDict(memory=state, batch_size=[2]))
+        state = step["next", "memory"]
+        taken.append(step["action"][0].item())
+    assert taken == [0, 0, 1, 1, 2, 2]

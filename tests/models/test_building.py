@@ -102,6 +102,32 @@ def test_pictures_may_be_bytes_and_have_their_colours_first():
 
 
 @pytest.mark.parametrize(
+    ("shape", "number"),
+    [((12, 15, 3), 3), ((4, 12, 15), 4), ((12, 12, 9), 9), ((9, 12, 12), 9), ((15, 12, 9), 9),
+     ((64, 8, 8), 64), ((9, 15, 12), 9)],
+)  # fmt: skip
+def test_colours_or_pictures_in_a_row_are_at_either_end(shape, number):
+    observed = Composite(observation=Unbounded((3, *shape)), shape=(3,))
+    critic = build(observed, encoders=ENCODERS)["critic"]
+    first = next(module for module in critic.modules() if isinstance(module, nn.Conv2d))
+    assert first.in_channels == number
+
+
+def test_a_picture_of_few_integers_is_scaled_by_the_largest():
+    """Planes of 0 and 1, as of a board, would nearly vanish beside bytes."""
+    plane = torch.randint(2, (3, 8, 8, 1), dtype=torch.uint8)
+    found = []
+    for most, picture in ((1, plane), (255, 255 * plane)):
+        observed = Composite(
+            observation=Bounded(0, most, plane.shape, dtype=torch.uint8), shape=[3]
+        )
+        torch.manual_seed(0)
+        critic = build(observed, encoders=ENCODERS)["critic"]
+        found.append(critic(TensorDict(observation=picture, batch_size=[3]))["state_value"])
+    torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize(
     ("observed", "model", "message"),
     [
         (

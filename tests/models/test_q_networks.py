@@ -3,10 +3,17 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torch.func import functional_call
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MLP, TanhNormal
+from torchrl.modules import (
+    MLP,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    TruncatedNormal,
+)
 
 from safe_rl.models import (
     EnsembleMLP,
@@ -58,7 +65,13 @@ def test_q_functions_see_scaled_observations_and_the_action():
     assert "state_action_value" not in steps.keys()  # noqa: SIM118
 
 
-@pytest.mark.parametrize("make", [make_squashed_actor, make_bounded_actor])
+def make_of_two_modules(size, low, high, hidden_sizes):
+    first = TensorDictModule(nn.Linear(size, size), ["observation"], ["features"])
+    last = make_bounded_actor(size, low, high, hidden_sizes=hidden_sizes, in_keys=["features"])
+    return TensorDictSequential(first, last)
+
+
+@pytest.mark.parametrize("make", [make_squashed_actor, make_bounded_actor, make_of_two_modules])
 def test_without_noise_an_explorer_acts_like_its_actor(make):
     actor = make(5, LOW, HIGH, hidden_sizes=[8])
     explorer, batch = ExploringPolicy(actor, LOW, HIGH, noise=0.5), observations(64)
@@ -68,8 +81,24 @@ def test_without_noise_an_explorer_acts_like_its_actor(make):
     assert ((found > LOW) & (found < HIGH)).all()
 
 
-def test_it_samples_the_distribution_of_a_squashed_actor():
-    actor = make_squashed_actor(5, LOW, HIGH, hidden_sizes=[8])
+def own_actor(distribution, **settings):
+    parameters = TensorDictModule(
+        nn.Sequential(nn.Linear(5, 4), NormalParamExtractor()), ["observation"], ["loc", "scale"]
+    )
+    kind = {"distribution_class": distribution, "distribution_kwargs": settings}
+    return ProbabilisticActor(parameters, in_keys=["loc", "scale"], **kind)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: make_squashed_actor(5, LOW, HIGH, hidden_sizes=[8]),
+        lambda: own_actor(TruncatedNormal, low=LOW, high=HIGH),
+        lambda: own_actor(TanhNormal, low=LOW, high=HIGH, tanh_loc=True),
+    ],
+)
+def test_it_samples_the_distribution_of_its_actor(make):
+    actor = make()
     batch = observations(1).expand(20_000).clone()
     with torch.no_grad():
         found = ExploringPolicy(actor, LOW, HIGH)(batch.clone())["action"]

@@ -35,7 +35,7 @@ from safe_rl.envs.foreign import FOREIGN, complete_foreign
 from safe_rl.envs.keys import ConfigError, found_costs
 from safe_rl.envs.pictures import load_backend
 from safe_rl.envs.rng import spread_seed
-from safe_rl.envs.torchrl.step_entries import Observe, StepCosts
+from safe_rl.envs.torchrl.step_entries import CompleteSteps, Observe, StepCosts
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import locate
 
@@ -197,7 +197,7 @@ def _batch(make: MakeEnv, num_envs: int) -> EnvBase:
         return env
     env.close(raise_if_closed=False)
     if not env.batch_size:
-        return SerialEnv(num_envs, make)
+        return SerialEnv(num_envs, partial(_complete, make))
     many = make(num_envs=num_envs)
     if list(many.batch_size) != [num_envs, 1]:
         return many
@@ -230,6 +230,10 @@ class Rows(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         self.env.set_seed(seed)
+
+
+def _complete(make: MakeEnv) -> EnvBase:
+    return TransformedEnv(make(), CompleteSteps())
 
 
 def _alone(make: MakeEnv) -> EnvBase:

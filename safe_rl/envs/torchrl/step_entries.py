@@ -10,7 +10,16 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.data import Binary, Bounded, Categorical, Composite, NonTensor, TensorSpec, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    NonTensor,
+    TensorSpec,
+    Unbounded,
+)
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
@@ -102,10 +111,12 @@ class StepCosts(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         costs = self._costs(tensordict.clone(False).set("next", next_tensordict))
-        done = next_tensordict["done"]
-        # where an environment writes `done` alone, `SerialEnv` leaves `terminated` False
-        ended = done & ~next_tensordict.get("truncated", torch.zeros_like(done))
-        written = {**costs, "terminated": next_tensordict["terminated"] | ended}
+        # where an environment writes some of these flags alone, `SerialEnv` leaves others False
+        done, terminated = next_tensordict["done"], next_tensordict["terminated"]
+        truncated = next_tensordict.get("truncated", torch.zeros_like(done))
+        written = {**costs, "done": done | terminated | truncated}
+        written["terminated"] = terminated | (done & ~truncated)
+        written["reward"] = next_tensordict["reward"].float()  # transforms would round others
         return next_tensordict.exclude(*self._entries.values()).update(written)
 
     def _reset(
@@ -126,12 +137,30 @@ class StepCosts(Transform):
         if not self._entries and self._function is None:
             highest.setdefault(COST, float(len(highest)))
         like: Any = {"device": rewards.device, "dtype": torch.float32}  # not torch's default
+        if rewards["reward"].dtype != torch.float32:
+            rewards["reward"] = Unbounded(rewards["reward"].shape, **like)
         for name in self.names:
             shape, most = (*rewards.shape, 1), highest.get(name)
             rewards[name] = (
                 Unbounded(shape, **like) if most is None else Bounded(0.0, most, shape, **like)
             )
         return output_spec
+
+
+class CompleteSteps(Transform):
+    """Refuses a step that lacks an entry: `SerialEnv` would repeat the one of an earlier step."""
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        env = self.container.base_env
+        specs = (env.observation_spec, env.full_reward_spec)
+        written = set(next_tensordict.keys(True, True))
+        for key in (key for spec in specs for key in spec.keys(True, True)):
+            if key not in written:
+                raise ConfigError(
+                    f"{type(env).__name__}: a step wrote no '{dotted(key)}', which is in its specs:"
+                    " write it in every step, for example 0 where it costs nothing."
+                )
+        return next_tensordict
 
 
 def _located(given: Any) -> Callable[[TensorDictBase], Any]:
@@ -156,7 +185,8 @@ class Observe(Transform):
     """Writes the observed entries into `observation`, which policies read.
 
     A single entry becomes the observation itself; several become one vector or a dictionary.
-    Categorical entries become one-hot; pictures stay as they are.
+    Categorical entries become one-hot, and those of several choices (MultiDiscrete) floats;
+    pictures stay as they are.
 
     Args:
         env: The environment, [N].
@@ -173,6 +203,8 @@ class Observe(Transform):
         name, spec = config.get("privileged"), env.observation_spec
         self._specs = _choose_entries(spec, config["observe"], name)
         self._privileged = {} if name is None else {name: spec[entry_key(name)]}
+        if any(map(_is_picture, self._privileged.values())):
+            raise ConfigError(f"env.privileged={name}: it is a picture, and critics read a vector.")
         self.privileged_layout = add_columns({}, {n: _size(s) for n, s in self._privileged.items()})
         self._flatten = config["flatten"] and len(self._specs) > 1
         pictures = [name for name, spec in self._specs.items() if _is_picture(spec)]
@@ -265,7 +297,7 @@ def _is_picture(spec: TensorSpec) -> bool:
 
 def _choices(spec: TensorSpec) -> int | None:
     """Number of choices of a categorical entry; None for any other."""
-    is_kind = isinstance(spec, Categorical) and not isinstance(spec, Binary)
+    is_kind = isinstance(spec, Categorical) and not isinstance(spec, Binary | MultiCategorical)
     return int(spec.space.n) if is_kind and spec.dtype != torch.bool else None
 
 

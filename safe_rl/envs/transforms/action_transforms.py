@@ -77,7 +77,7 @@ class ActionFilter(ConstraintTransform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action")
         # a copy, because the algorithm learns from the original and a filter may work in place
-        replaced = self._filter(tensordict.set("action", action.clone()), **self._asked())
+        replaced = self._filter(tensordict.clone(), **self._asked())
         if not isinstance(replaced, Tensor) or replaced.shape != action.shape:
             got = tuple(replaced.shape) if isinstance(replaced, Tensor) else type(replaced).__name__
             raise ConfigError(
@@ -113,8 +113,9 @@ class ActionFilter(ConstraintTransform):
 class ActionDelay(ConstraintTransform):
     """Actions take effect some steps later, also in evaluation.
 
-    In the first steps of an episode the environment gets the action nearest to 0, or the first
-    discrete action. Pending actions are not observed, so recurrent policies have an advantage.
+    In the first steps of an episode the environment gets the action nearest to 0, in the units in
+    which policies choose actions, or the first discrete action. Pending actions are not observed,
+    so recurrent policies have an advantage.
 
     Args:
         steps: Steps from an action to its effect.
@@ -132,7 +133,7 @@ class ActionDelay(ConstraintTransform):
 
     def start(self, done: Tensor) -> dict[str, Tensor]:
         """Return `steps` neutral actions."""
-        spec = self.container.action_spec
+        spec = self.parent.action_spec  # of the environment with the transforms before this one
         nothing = spec.zero()
         if isinstance(spec, OneHot):
             nothing[..., 0] = 1

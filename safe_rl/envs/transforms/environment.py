@@ -20,6 +20,7 @@ from torchrl.envs.transforms import Compose, Transform, VecNorm, VecNormV2
 from safe_rl.checks import Checked
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
+from safe_rl.envs.keys import is_cost
 from safe_rl.naming import did_you_mean
 from safe_rl.trust import TargetError, instantiate
 
@@ -158,6 +159,12 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
             try:
                 transform.check(self.cost_keys)
                 layout = transform.extend_layout(layout)
+                for key in transform.added_costs:
+                    if key in self.cost_keys or not is_cost(key):
+                        raise ValueError(
+                            f"cost_key={key}: choose another name, cost_<kind>, which no other "
+                            "cost has."
+                        )
             except ValueError as error:
                 raise ValueError(f"transforms.{name}: {error}") from error
             self.cost_keys += transform.added_costs
