@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from safe_rl.checks import CheckedOptions, option
 from safe_rl.cli.options import OptionError, run_command
@@ -55,7 +55,9 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         target.parent.mkdir(parents=True, exist_ok=True)
         with closing(run.make_env()) as env:
             export_onnx(run, env, checkpoint, target, sampled=sampled)
-        if names := ", ".join(transforms_of(run.config)):
+        # the file's actions have the environment's own units already
+        others = {n: t for n, t in transforms_of(run.config).items() if not _is_scaling(t)}
+        if names := ", ".join(others):
             print(
                 f"The file has the policy without the transforms {names}: your program has to do "
                 "what they do (see its metadata), and a certificate is about both together."
@@ -64,6 +66,10 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         pack_policy(run.directory, target, which)
     print(f"wrote {target}")
     return 0
+
+
+def _is_scaling(transform: Mapping[str, Any]) -> bool:
+    return str(transform.get("_target_")).endswith(".ActionScaling")
 
 
 def _choose_actions(run: Run, checkpoint: Path, asked: str | None) -> bool:

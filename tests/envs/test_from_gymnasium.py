@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 from gymnasium_envs import Walk, make_pendulum
 from torchrl.envs.utils import check_env_specs
 
@@ -242,6 +242,11 @@ def test_a_new_environment_can_be_copied():
         (acting(Box(-np.inf, np.inf, (1,))), {}, r"or choices \(Discrete.*, got Unbounded"),
         (acting(Box(0.0, np.inf, (2,))), {}, r"finite bounds.* \[0.0, 0.0\] and \[inf, inf\]"),
         (Counter(), {}, r"'env' must be an id or a function.* give its class, or a function"),
+        (
+            acting(Dict(a=Box(0.0, 1.0))),
+            {"cost_keys": ["cost"]},
+            "Actions have several parts, Dict",
+        ),
         (Counter, {"num_steps": None}, "give 'num_steps'"),
         (Counter, {"num_envs": 0}, "num_envs=0: it must be greater than or equal to 1"),
         (Counter, {"outside": {"cost_a": ["count", 0, 2]}}, "'count'.*need flatten=False"),

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from point_mass import PointMass
-from torchrl.envs import TransformedEnv
+from torchrl.envs import ActionDiscretizer, TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.envs.utils import check_env_specs
 from transforming import (
@@ -173,6 +173,14 @@ def test_transforms_of_torchrl_can_stand_among_ours():
         assert env.rollout(3)["next", "step_count"][0, :, 0].tolist() == [1, 2, 3]
         assert env.highest_cost("cost") == transformed(PointMass(2), "saute").highest_cost("cost")
         assert env.get_state() is None
+
+
+@pytest.mark.parametrize("env", ["gymnasium", "safety_gym"])
+def test_actions_at_random_are_those_that_the_transforms_take(env):
+    discrete = transformed(env, units=ActionDiscretizer(3))
+    actions = discrete.rollout(20)["action"]
+    assert discrete.action_spec.is_in(actions[:, 0])
+    assert actions.unique().numel() > 1
 
 
 def test_nodes_are_built_and_their_keys_named():

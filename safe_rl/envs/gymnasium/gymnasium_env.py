@@ -43,6 +43,8 @@ def make_adapted(
     env: gymnasium.Env = CheckedSteps(make(), cost_keys, watch)
     seen, actions = env.observation_space, env.action_space
     entries = dict(seen) if isinstance(seen, spaces.Dict) else {}
+    if isinstance(actions, spaces.Tuple | spaces.Dict):
+        raise ConfigError(f"Actions have several parts, {actions}: join them by a wrapper.")
     if flatten:
         env = FlattenObservation(env)
     elif isinstance(seen, spaces.Tuple):

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform, VecNorm, VecNormV2
 
 from safe_rl.checks import Checked
@@ -193,6 +193,10 @@ class TransformedConstrainedEnv(ConstrainedEnv, TransformedEnv):
         for transform in self._ours.values():
             highest = transform.highest_cost(key, highest, of_a_step)
         return highest
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Draw actions from the spec, which transforms may have changed."""
+        return EnvBase.rand_action(self, tensordict)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed all later random draws of the environment and of its transforms."""
