@@ -32,7 +32,10 @@ def nodes(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 def compose_config(*overrides: str) -> DictConfig:
     """Compose ``conf/config.yaml`` with command-line overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides))
+        config = compose("config", overrides=list(overrides))
+    if config.cost_limits == "default":  # as `check_settings` does, for a composed algorithm
+        config.cost_limits = config.default_cost_limits or {}
+    return config
 
 
 def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictConfig:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from shlex import quote
+from threading import RLock
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -43,6 +44,8 @@ from safe_rl.trust import check_imports
 _MOST_LISTED = 40
 RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
+COMPOSING = RLock()
+"""Held while Hydra composes: its state and its ConfigStore are those of the process."""
 COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
     *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
@@ -85,13 +88,14 @@ def _searched(folders: Iterable[str | Path]) -> list[str]:
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
     # an application of the user's may be on Hydra too, and call `safe_rl.train`
-    outside = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
-            return compose(name, list(words), return_hydra_config=True)
-    finally:
-        GlobalHydra.instance().hydra = outside
+    with COMPOSING:
+        outside = GlobalHydra.instance().hydra
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
+                return compose(name, list(words), return_hydra_config=True)
+        finally:
+            GlobalHydra.instance().hydra = outside
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -139,6 +143,9 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         return _absent(missing[1])
     unknown = re.match(r"Could not override '([^']+)'\.", str(error))
     if isinstance(error, ConfigCompositionException) and unknown:
+        is_group = "No match in the defaults list" in str(error) and RESUMED not in " ".join(words)
+        if is_group and unknown[1] not in General.__annotations__:
+            return f"{unknown[1]}: nothing is chosen that it could replace; add it, +{unknown[1]}=…"
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         return _unknown_key(inner[1] if inner else unknown[1], unknown[1], words)
     foreign = re.search(r"(?s)In '(\S+)': .*Key '\S+' not in '(\S+)'\s+full_key: (\S+)", str(error))
@@ -265,6 +272,10 @@ def read_resumed(
     _refuse_foreign_cluster(config, words, directory)
     if modules is not None:
         config["import"] = list(modules)
+    for name in ("policy_update", "critic_update"):
+        part = config.get(name) or {}
+        if part.get("compile", "") == config.get("compile"):  # they follow it, as in a new run
+            config[name] = {**part, "compile": "${compile}"}
     if any(re.match(r"logger='?\w", word) for word in words):
         config.pop("logger", None)  # keys of another logger would stay
     place = str(directory).replace("${", "\\${")

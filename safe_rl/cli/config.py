@@ -207,6 +207,8 @@ def check_settings(config: DictConfig) -> None:
         with open_dict(config):
             for name in [key for key in config if OmegaConf.is_missing(config, key)]:
                 del config[name]
+            if config.get("cost_limits") == "default":
+                config.cost_limits = config.default_cost_limits or {}
             if config.algo.get("constrained") is False:  # presets have limits for others
                 config.pop("limits", None)
         _check_parts(config)

@@ -26,7 +26,7 @@ from safe_rl.models import BehaviourPolicy, ExploringPolicy, make_behaviour
 from safe_rl.naming import did_you_mean
 from safe_rl.runs.checkpoints import read_facts, read_states
 from safe_rl.runs.folder import checkpoint_name, checkpoint_steps, is_unfinished
-from safe_rl.runs.identity import config_dirs, repeating
+from safe_rl.runs.identity import changed_settings, config_dirs, repeating
 from safe_rl.runs.run import Run
 
 POLICIES = Path(__file__).parents[1] / "policies"
@@ -83,12 +83,13 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     is_certified = source.certificate_of(path) is not None
     kept = target.checkpoints_folder / ("certified" if is_certified else "last")
     kept /= checkpoint_name(steps or 0)
-    overrides, hydra = (
+    overrides, hydra, composed = (
         read_yaml(file) if file.is_file() else None
-        for file in (source.overrides_file, source.hydra_file)
+        for file in (source.overrides_file, source.hydra_file, source.composed_file)
     )
+    changed = changed_settings(composed, source.settings)
     about = {"environment": config.env.get("name", ""), "algorithm": config.algo.name}
-    about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra))}
+    about |= {"steps": steps, "command": repeating(overrides or [], config_dirs(hydra), changed)}
     about["commit"] = source.commit
     # first: an export that was killed can be repeated into its folder
     folder.mkdir(parents=True, exist_ok=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,7 +25,13 @@ from safe_rl.files import read_bounded, read_config, read_json, read_yaml, repla
 from safe_rl.reporting.tables import clean, read_certificate, read_code, read_evaluation
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
-from safe_rl.runs.identity import config_dirs, differences, repeating, select, unusable_keys
+from safe_rl.runs.identity import (
+    changed_settings,
+    config_dirs,
+    differences,
+    repeating,
+    unusable_keys,
+)
 from safe_rl.runs.table import read_table
 
 RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
@@ -96,9 +103,13 @@ class Run(folders.Run):
         """The command that repeats it, or None if its overrides are not recorded."""
         if self.overrides is None:
             return None
-        is_continued = isinstance(self.notes.get("frames_before"), int)
-        frames = self.settings["frames"] if is_continued else None
-        return repeating(self.overrides, map(clean, self.notes.get("config_dirs", ())), frames)
+        folders, changed = map(clean, self.notes.get("config_dirs", ())), self.changed
+        return repeating(self.overrides, folders, {clean(k): v for k, v in changed.items()})
+
+    @property
+    def changed(self) -> dict[str, Any]:
+        """Settings that ``resume=`` has changed, by dotted keys."""
+        return dict(self.notes.get("changed", {}))
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
@@ -116,6 +127,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for path in paths_below(root, RUNS):
         with _noted(path, skipped):
             candidates += read_archive(path.parent).values()
+    skipped |= dict.fromkeys(_links(root), "it is a link to a folder, which is not followed")
     for folder in folders.find_runs(root):
         with _noted(folder.directory, skipped):
             candidates.append(_read_run(folder, skipped))
@@ -132,6 +144,13 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
             f"progress.csv, as train.py writes it.{reasons}"
         )
     return sorted(runs, key=lambda run: run.directory), skipped
+
+
+def _links(root: Path) -> Iterator[Path]:
+    """Links to folders below a folder, but for those of Weights & Biases."""
+    for folder, names, _ in os.walk(root):
+        if Path(folder).name != "wandb":
+            yield from (path for name in names if (path := Path(folder, name)).is_symlink())
 
 
 @contextmanager
@@ -164,11 +183,10 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
     with _noted(folder.table_file, skipped):
         if not read_bounded(folder.table_file, _MOST_BYTES).endswith(b"\n"):
             raise ValueError("its last line does not end with a line break, and is not read")
-    before = select(read(folder.composed_file), "frames")
     notes = {
         "overrides": read(folder.overrides_file),
         "config_dirs": config_dirs(read(folder.hydra_file)) or None,
-        "frames_before": before if before != settings.get("frames") else None,
+        "changed": changed_settings(read(folder.composed_file), settings) or None,
         "certificate": read(folder.certificate_file, read_certificate),
         "code": read(folder.code_file, read_code),
         "evaluations": [

@@ -208,7 +208,12 @@ def _settings_of_names(
 
 
 def _is_given(key: str, run: Run) -> bool:
-    """Whether a user has set a key, or chosen the group that it belongs to."""
+    """Whether a user has set a key, or chosen the group that it belongs to.
+
+    In a run with YAML files of the user's, any key may have been set there.
+    """
+    if run.notes.get("config_dirs") or key in run.changed:
+        return True
     keys = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
     return key.partition(".")[0] in _ALWAYS_NAMED or any(
         key == given or key.startswith(f"{given.partition('@')[0]}.") for given in keys

@@ -6,6 +6,7 @@ Hydra's notes of a run have the settings of its command line: its command is mad
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import shlex
@@ -155,6 +156,25 @@ def differences(
     }
 
 
+def changed_settings(composed: Any, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted key -> present value, of keys that ``resume=`` has changed since a run was composed.
+
+    Examples:
+        >>> changed_settings({"seed": 0, "loss": {"clip_epsilon": 0.2}},
+        ...                  {"seed": 0, "loss": {"clip_epsilon": 0.1}, "frames": 20})
+        {'loss.clip_epsilon': 0.1}
+    """
+    before = flatten(composed) if isinstance(composed, Mapping) else {}
+    return {
+        key: value
+        for key, value in flatten(settings).items()
+        # values that Hydra computes are not known: nothing of a file is resolved
+        if before.get(key, value) != value
+        and "${" not in str(before[key])
+        and role_of(key).names_experiment
+    }
+
+
 def _comparable(config: Mapping[str, Any]) -> dict[str, Hashable]:
     flat = flatten(config)
     transforms = config.get("transforms") or {}
@@ -269,10 +289,12 @@ def config_dirs(notes: Any) -> list[str]:
     return [os.path.relpath(path, start) if start else path for path in paths]
 
 
-def repeating(overrides: Sequence[str], folders: Iterable[str], frames: int | None = None) -> str:
+def repeating(
+    overrides: Sequence[str], folders: Iterable[str], changed: Mapping[str, Any] = {}
+) -> str:
     """The command that repeats a run: from Hydra's notes, and the folders of ``--config-dir``.
 
-    `frames` is given if the run was continued to more than the overrides say.
+    `changed` are `changed_settings`, which the command has from its start.
 
     Examples:
         >>> words = ["import=['my_gym.py','mine']", "cost_limits={cost: 5}"]
@@ -284,7 +306,7 @@ def repeating(overrides: Sequence[str], folders: Iterable[str], frames: int | No
         key, _, value = word.partition("=")
         if key == "import":  # Hydra's notes have a list with quotes
             words += [f"import={name}" for name in yaml.safe_load(value)]
-        elif frames is None or key != "frames":
+        elif key.lstrip("+") not in changed:
             words.append(word)
-    words += [] if frames is None else [f"frames={frames}"]
+    words += [f"{key}={json.dumps(value)}" for key, value in changed.items()]
     return shlex.join([*PROGRAM.split(), *words])

@@ -252,6 +252,10 @@ class Run:
     @cached_property
     def table(self) -> dict[str, list[float]]:
         """The columns of ``progress.csv``; NaN in epochs in which no episode ended."""
+        if not self.table_file.exists():
+            raise FileNotFoundError(
+                f"{self.directory} has no progress.csv: an exported policy has no table."
+            )
         return read_table(self.table_file)
 
     @property

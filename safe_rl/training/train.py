@@ -12,6 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from shlex import quote
 from signal import SIGINT, Signals
+from threading import Lock
 from typing import Any
 
 import torch
@@ -89,7 +90,7 @@ def train(
     with _ending_cleanly(run, config), _alone(run), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
-            print(f"{done}. To train on: {again} frames={2 * config.frames:_}")
+            print(f"{done}. To train on: {_longer(again, 2 * max(run.steps, config.frames))}")
             with closing(make_env(node_of(run, config), num_envs=1)) as env:
                 stopped_by, length = None, env.max_episode_steps
         else:
@@ -113,19 +114,21 @@ def train(
     return run
 
 
-_TRAINED: dict[Path, Run] = {}  # folder -> the run that this process trains there
+_TRAINING = Lock()
 
 
 @contextmanager
 def _alone(run: Run) -> Iterator[None]:
-    """Refuse to train in a folder twice at a time; the lock of a folder is that of a process."""
-    place = run.directory.resolve()
-    if _TRAINED.setdefault(place, run) is not run:
-        raise RunInUseError(f"{run.directory} is being trained by this process already.")
+    """Refuse to train twice at a time in one process, which has one generator of random numbers."""
+    if not _TRAINING.acquire(blocking=False):
+        raise RunInUseError(
+            f"{run.directory}: this process trains a run already, and both would draw from one "
+            "generator. Train one after the other, or in processes of their own, as a sweep does."
+        )
     try:
         yield
     finally:
-        del _TRAINED[place]
+        _TRAINING.release()
 
 
 def complete(config: DictConfig, run: Run) -> None:
@@ -143,6 +146,12 @@ def _command_again(run: Run, config: DictConfig, program: str | None) -> str:
         return f"{program}{import_words(config)} resume={quote(str(run.directory))}"
     modules = list(config.get("import") or [])
     return f"safe_rl.resume({str(run.directory)!r}{f', imports={modules}' if modules else ''})"
+
+
+def _longer(again: str, frames: int) -> str:
+    """The command that continues a run, or the call in Python, with more frames."""
+    is_call = again.endswith(")")
+    return f"{again[:-1]}, frames={frames:_})" if is_call else f"{again} frames={frames:_}"
 
 
 @contextmanager
@@ -304,7 +313,7 @@ def certify_finished(
         return end_by(SIGINT, later)
     say(str(result))
     if result is not None and result.checkpoint is None and result.may_need_training:
-        say(f"To train on: {again} frames={2 * config.frames:_}")
+        say(f"To train on: {_longer(again, 2 * config.frames)}")
 
 
 def import_words(config: DictConfig) -> str:

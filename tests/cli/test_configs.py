@@ -4,6 +4,7 @@ import itertools
 import sys
 
 import pytest
+from commands import composed, status_of
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from point_mass import PointMass
@@ -126,6 +127,24 @@ def test_the_help_has_the_keys_of_a_file_that_builds_on_an_environment(tmp_path)
     with initialize_config_dir(str(CONF), version_base="1.3"):
         env = compose("config", [f"hydra.searchpath=[file://{tmp_path}]", "env=crowd"]).env
     assert (env.hazards_num, env.robot_base) == (17, "car")
+
+
+def test_limits_of_a_file_take_the_place_of_the_default(tmp_path):
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\ncost_limits: {cost_hazards: 10}\n"
+    (tmp_path / "experiment" / "mine.yaml").write_text(text)
+    words = [f"--config-dir={tmp_path}", "env=PointGoal1"]
+    for more, limits in (
+        ([], {"cost": 25}),
+        (["cost_limits={cost_hazards: 3}"], {"cost_hazards": 3}),
+        (["+experiment=mine"], {"cost_hazards": 10}),
+        (["+experiment=mine", "cost_limits.cost_hazards=5"], {"cost_hazards": 5}),
+        (["cost_limits={}", "algo=ppo"], {}),
+    ):
+        (config,) = composed(*words, *more)
+        assert config.cost_limits == limits
+    message = "experiment: nothing is chosen that it could replace; add it, +experiment=…"
+    assert status_of(*words, "experiment=mine") == message
 
 
 # The whole of what decides how a run of algo=paper/… learns, from the paper's section 5.2 and the

@@ -363,9 +363,9 @@ def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
     run = safe_rl.resume(tmp_path, frames=400, callbacks=[lambda row: row["steps"] < 120])
     assert run.table["steps"] == [40, 80, 120]
 
-    def again(row):
-        safe_rl.resume(tmp_path, frames=800)
+    def another(row):  # it would seed the generator of this run
+        safe_rl.train("PointGoal1", directory=tmp_path / "other", frames=40, **SMALL)
 
-    with pytest.raises(RunInUseError, match="is being trained by this process already"):
-        safe_rl.resume(tmp_path, frames=400, callbacks=[again])
+    with pytest.raises(RunInUseError, match="this process trains a run already"):
+        safe_rl.resume(tmp_path, frames=400, callbacks=[another])
     assert safe_rl.resume(tmp_path, frames=200).table["steps"][-1] == 200

@@ -48,6 +48,13 @@ def test_folders_may_have_any_name(begun, tmp_path, name):
     assert config.algo == point_mass_config().algo
 
 
+def test_the_updates_are_compiled_if_the_run_is(run):
+    config = resumed(run, "compile=true")
+    assert (config.policy_update.compile, config.critic_update.compile) == (True, True)
+    config = resumed(run, "compile=true", "critic_update.compile=false")
+    assert (config.policy_update.compile, config.critic_update.compile) == (True, False)
+
+
 @pytest.mark.parametrize(
     "override",
     [

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import yaml
 from synthetic import grouped, write_run
 
 from safe_rl.files import CONF
@@ -59,19 +60,47 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
     ]
     record = {"hydra": {"runtime": {"config_sources": sources}, "run": {"dir": "${oc.env:HOME}"}}}
     (run / ".hydra/hydra.yaml").write_text(json.dumps(record))
-    (run / ".hydra/config.yaml").write_text("frames: 500")
-    # it was continued to 1000
+    (run / ".hydra/config.yaml").write_text("{frames: 500, device: cuda, model: {sizes: [8]}}")
+    # it was continued to 1000, and with other sizes
+    config = yaml.safe_load((run / "config.yaml").read_text()) | {"model": {"sizes": [16]}}
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
     (found,), _ = find_runs(tmp_path)
     assert found.repeating == (
-        "python train.py '--config-dir=/home/me/my conf' env=PointGoal1 seed=0 frames=1000"
+        "python train.py '--config-dir=/home/me/my conf' env=PointGoal1 seed=0 frames=1000 "
+        "'model.sizes=[16]'"
     )
     (run / ".hydra/config.yaml").write_text("frames: ${paper.frames.point}")
     (run / ".hydra/hydra.yaml").unlink()
     assert find_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
+def test_names_have_what_a_file_of_the_users_or_resuming_has_changed(tmp_path):
+    """As in `+experiment=mine loss.clip=0.1`, whose command line has one of two differences."""
+    plain = {"loss": {"clip": 0.2}, "policy_update": {"max_kl": 0.01}}
+    changed = {"loss": {"clip": 0.1}, "policy_update": {"max_kl": 0.05}}
+    write_run(tmp_path, algo="mine", folder="plain", **plain)
+    of_file, continued = (
+        write_run(tmp_path, algo="mine", folder=name, overrides=["loss.clip=0.1"], **changed)
+        for name in ("file", "continued")
+    )
+    assert [name for _, name, _ in names(grouped(tmp_path)[0])] == ["mine", "mine (loss.clip=0.1)"]
+    source = {"path": "/home/me/conf", "provider": "command-line"}
+    record = {"hydra": {"runtime": {"config_sources": [source]}}}
+    (of_file / ".hydra/hydra.yaml").write_text(json.dumps(record))
+    (continued / ".hydra/config.yaml").write_text(json.dumps(plain | {"loss": changed["loss"]}))
+    for folder in (of_file, continued):
+        others = continued if folder is of_file else of_file
+        kept = others.rename(tmp_path.with_name(f"{tmp_path.name}_kept"))
+        _, (_, name, _) = names(grouped(tmp_path)[0])
+        assert name == "mine (loss.clip=0.1, policy_update.max_kl=0.05)"
+        kept.rename(others)
+
+
 def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     good = write_run(tmp_path)
+    (tmp_path / "again").symlink_to(good)
+    (good / "wandb").mkdir()
+    (good / "wandb" / "latest-run").symlink_to(good)
     wandb = good / "wandb" / "offline-run-20260131_120000-ab12" / "files"
     wandb.mkdir(parents=True)
     (wandb / "config.yaml").write_text("wandb_version: 1\n")  # is not even named
@@ -86,7 +115,8 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     runs, skipped = find_runs(tmp_path)
     assert [run.directory for run in runs] == [good]
     reasons = {path.name: reason for path, reason in skipped.items()}
-    assert len(reasons) == 5
+    assert len(reasons) == 6
+    assert reasons["again"] == "it is a link to a folder, which is not followed"
     assert reasons["f1"].endswith("it lacks a usable env, algo, seed, frames")
     assert reasons["f2"] == "no progress.csv: it is no run of safe_rl, or has not begun"
     assert reasons["f3"] == "it has not finished an epoch"
