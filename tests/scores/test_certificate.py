@@ -45,6 +45,24 @@ def test_a_test_ends_as_soon_as_it_may_and_gives_up_where_there_is_no_hope():
     assert (hopeless.certified, hopeless.episodes) == (None, 200)
 
 
+@pytest.mark.parametrize(("cost", "is_given_up"), [(0.24, True), (0.26, False)])
+def test_a_test_is_given_up_below_a_quarter_of_what_its_best_bet_needs(cost, is_given_up):
+    """Of constant costs, every episode multiplies the wealth of the largest bet by one factor."""
+    needed = np.log(20) / np.log(1 + 0.99 * (25 - 24) / (200 - 25))  # episodes, of this bet alone
+    most = round(cost * needed)
+    free = {"kept": 9.0, "never": 8.0}
+    claim = Claim({"cost": 25.0, "kept": 8.0, "never": 9.0}, highest={"cost": 200.0} | free)
+
+    def may_end(episodes, most):
+        costs = {"cost": np.full(episodes, 24.0), **{key: np.zeros(episodes) for key in free}}
+        return claim.may_end(costs, 1, most)
+
+    first = -(-most // 5)  # a fifth of the episodes
+    assert [may_end(first - 1, most), may_end(first, most)] == [False, is_given_up]
+    # all limits are shown, not only those that cost nothing
+    assert [may_end(400, 4000), may_end(1000, 4000)] == [False, True]
+
+
 def test_bounds_and_shortfalls_are_those_of_the_policy_that_fell_short_least():
     costs = [np.full(50, mean) for mean in (30.0, 27.0, 45.0)]
     verdict = first_certified([0, 1, 2], lambda k: batches(costs[k]), [CLAIM] * 3, 3, 50)
@@ -63,6 +81,17 @@ def test_bounds_and_shortfalls_are_those_of_the_policy_that_fell_short_least():
 
 def test_nothing_tested_is_nothing_certified():
     assert first_certified([], dict, [], tests=3, episodes=9).certified is None
+
+
+def test_no_more_policies_are_tested_than_share_the_error_and_no_more_episodes_than_are_asked_for():
+    costs = [np.full(60, mean) for mean in (30.0, 31.0, 0.0, 0.0)]
+    found = [
+        first_certified([0, 1, 2, 3], lambda k: batches(costs[k]), [CLAIM] * 4, tests, 60)
+        for tests in (2, 3)
+    ]
+    assert [(one.certified, one.tested) for one in found] == [(None, [0, 1]), (2, [0, 1, 2])]
+    few = first_certified([0], lambda k: batches(costs[k]), [CLAIM], 1, 30)
+    assert (few.episodes, few.bounds) == (30, CLAIM.bounds({"cost": costs[0][:30]}, 1))
 
 
 def test_every_limit_is_tested_at_the_level_of_the_test():
@@ -105,6 +134,12 @@ def test_costs_without_a_highest_count_up_to_a_cap_and_few_may_cost_more():
     assert list(replace(CLAIM, cap=300.0).bounds({"cost": costs}, tests=1)) == ["mean_cost"]
     with pytest.raises(ValueError, match="cap=25: it must be above every limit"):
         replace(CLAIM, cap=25.0)
+    with pytest.raises(ValueError, match="cap=10: it must be above every limit"):
+        Claim({"cost": 25.0, "cost_hazards": 5.0}, cap=10.0)
+    given = Claim({"cost": 25.0}, cap=100.0).bounds({"cost": costs}, tests=1)
+    assert list(given) == ["beyond_100_cost", "mean_cost"]
+    known = Claim({"cost": 25.0}, highest={"cost": 1000.0}).bounds({"cost": costs}, tests=1)
+    assert known == {"mean_cost": (betting_bound(costs, 0.95, 1000.0), 25.0)}
     many = np.r_[np.full(780, 10.0), np.full(20, 260.0)]
     assert list(Claim({"cost": 25.0}).shortfalls({"cost": many}, tests=1)) == ["beyond_250_cost"]
 
@@ -121,6 +156,13 @@ def test_the_mean_of_the_costliest_episodes_is_bounded_from_above():
     assert CLAIM.with_thresholds({"cost": costs}) is CLAIM
 
 
+def test_what_is_tested_of_the_costliest_episodes_has_their_mean_and_the_highest_cost_of_all():
+    costs = {"cost": np.r_[np.arange(9.0), 200.0]}
+    (tested,) = replace(CLAIM, tail=0.2).with_thresholds(costs).statements(costs)
+    assert tested.values.mean() == pytest.approx((8 + 200) / 2)
+    assert tested.values.max() == pytest.approx(tested.highest)
+
+
 def test_candidates_are_ordered_by_what_the_tests_will_ask_for():
     rng, claim = np.random.default_rng(0), Claim({"cost": 100.0, "cost_hazards": 5.0})
     means = [(99.0, 4.0), (90.0, 4.0), (110.0, 4.0), (90.0, 7.0)]
@@ -130,13 +172,16 @@ def test_candidates_are_ordered_by_what_the_tests_will_ask_for():
     # on average within its limit, but not by enough standard errors
     costs[0]["cost"] += 20 * stats.zscore(rng.normal(size=50))
     # then a tenth of a limit too much, and two fifths of another one
-    assert rank([[9.0], [5.0], [9.0], [9.0]], costs, [claim] * 4) == [1, 0, 2, 3]
+    assert rank([[9.0], [-5.0], [99.0], [999.0]], costs, [claim] * 4) == [1, 0, 2, 3]
+    assert rank([[1.0], [2.0]], [{"cost": [1.0]}] * 2, [CLAIM] * 2) == [1, 0]  # of one episode
 
 
 @pytest.mark.parametrize("highest", [{"cost": 1000.0}, {}])
 def test_a_limit_of_0_is_never_certified(highest):
     claim = Claim({"cost": 0.0}, highest=highest)
     assert 0 < claim.shortfalls({"cost": np.zeros(10_000)}, tests=1)["mean_cost"] < 1
+    found = claim.bounds({"cost": np.zeros(9)}, tests=1)
+    assert list(found) == [*([] if highest else ["beyond_10_cost"]), "mean_cost"]
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf], ids=["nan", "infinite"])
