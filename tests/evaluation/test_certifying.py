@@ -15,7 +15,7 @@ from safe_rl.evaluation import Certificate, CertificateOptions, certify, certify
 from safe_rl.evaluation.certifying import _TEST
 from safe_rl.evaluation.policies import pack_policy
 from safe_rl.runs.run import Run
-from safe_rl.scores.certificate import Verdict
+from safe_rl.scores.certificate import Claim, Verdict
 from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
@@ -104,11 +104,12 @@ def test_a_certificate_is_about_the_policy_beside_it_whenever_it_is_interrupted(
 def test_tests_of_a_run_spend_its_error_once_each(train):
     directory = train("{cost: 19}")
     longer = [replace(OPTIONS, episodes=120 + 100 * k) for k in range(3)]
-    for options in (*longer, longer[0]):
-        certify(directory, options, make_env=make_env)
+    made = [certify(directory, each, make_env=make_env) for each in (*longer, longer[0])]
     tests = json.loads((directory / "certificate_tests.json").read_text())
     errors = [test["error"] for test in tests]
     assert errors == pytest.approx([0.0375, 0.009375, 0.00234375])
+    levels = [Claim({"cost": 19.0}, level=1 - e, highest={"cost": 20.0}) for e in errors]
+    assert [one.fewest for one in made] == [level.fewest(2) for level in (*levels, levels[0])]
     assert json.loads((directory / "certificate.json").read_text())["test"] == 1
     strict = replace(OPTIONS, level=0.99)
     with pytest.raises(ValueError, match=r"have spent an error of 0\.0492"):
@@ -190,7 +191,9 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
     assert list(before.parent.iterdir()) == [before]
     for kind in ("best", "last"):
         (directory / "checkpoints" / kind / before.name).unlink(missing_ok=True)
-    after = certify(directory, OPTIONS, make_env=make_env).checkpoint
+    third = certify(directory, OPTIONS, make_env=make_env)
+    after = third.checkpoint
+    assert third.test == 3  # as of other checkpoints
     assert after.name != before.name
     assert list(after.parent.iterdir()) == [after]
     config = directory / "config.yaml"
@@ -225,15 +228,16 @@ def test_one_candidate_has_the_error_of_a_test_alone_and_episodes_that_have_not_
         return make_env(node, seed=seed, **keys)
 
     fewest = []
-    for place, tests in (("run", 1), ("alone", 1), ("of three", 3)):
+    for place, tests in (("run", 1), ("alone", 1), ("of three", 3), ("run again", 2)):
         tested[place] = set()
-        folder = run if place == "run" else pack_policy(run, tmp_path / place).parents[2]
+        folder = run if place.startswith("run") else pack_policy(run, tmp_path / place).parents[2]
         options = replace(OPTIONS, tests=tests)
         fewest.append(certify(folder, options, make_env=make).fewest)
     assert fewest[0] == fewest[1] == fewest[2]
     seeds = {place: {seed for seed in found if seed > _TEST} for place, found in tested.items()}
     assert seeds["alone"] == seeds["of three"]
     assert not seeds["run"] & seeds["alone"]
+    assert not seeds["run"] & seeds["run again"]
 
 
 def test_a_device_that_this_machine_lacks_is_replaced(train, monkeypatch):
@@ -296,9 +300,10 @@ def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train
 
 def test_a_limit_on_the_costliest_episodes_is_certified_for_them(train):
     directory = train("{cost: 19}")
-    certificate = certify(directory, replace(OPTIONS, tail=0.5), make_env=make_env)
-    ((name, (_, most)),) = certificate.verdict.bounds.items()
-    assert (name, most) == ("cvar_cost", 19.0)
+    shares = {"tail": 0.5, "most_over": 0.9, "cap": 19.5, "most_beyond": 0.2}
+    certificate = certify(directory, replace(OPTIONS, **shares), make_env=make_env)
+    limits = {name: most for name, (_, most) in certificate.verdict.bounds.items()}
+    assert limits == {"beyond_19.5_cost": 0.2, "cvar_cost": 19.0, "over_limit_cost": 0.9}
     plain = certify(directory, OPTIONS, make_env=make_env)
     assert certificate.means["cvar_cost"] > plain.means["mean_cost"]
     # the highest cost of an episode, not the highest value of the tested mean
