@@ -67,6 +67,10 @@ def test_the_descent_goes_on_from_the_cost_where_that_came_down_faster():
     # and never up again
     later = limits.update(torch.full((20, 100, 1), 0.2), NO_EPISODES)
     assert later.target < state.target
+    # of a policy that costs less than its limit from the first, it is the limit
+    cheap = tracker(margin=0.0, free_steps=0, drift=None)
+    states = [cheap.update(torch.full((20, 100, 1), 0.01), NO_EPISODES) for _ in range(3)]
+    assert [state.target for state in states] == [25.0] * 3
 
 
 def test_the_margin_makes_a_batch_exceed_the_limit_as_often_as_z_says():
