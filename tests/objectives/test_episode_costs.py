@@ -3,7 +3,13 @@
 import pytest
 import torch
 
-from safe_rl.objectives.episode_costs import CostEstimate, EpisodeCosts, rate_estimate, shrink
+from safe_rl.objectives.episode_costs import (
+    CostEstimate,
+    EpisodeCosts,
+    EpisodeLengths,
+    rate_estimate,
+    shrink,
+)
 
 
 def renewals(rows: int, steps: int, generator: torch.Generator):
@@ -76,6 +82,16 @@ def test_the_length_follows_episodes_that_grow_longer_and_shorter_again():
     assert shrinkage.mean().abs() < 0.05
 
 
+def test_the_length_counts_steps_of_batches_without_ends_and_the_last_hundred_ends():
+    one_row, changed = EpisodeLengths(100), EpisodeLengths(100)
+    for batch in range(50):  # of 10 steps, in episodes of 25
+        ends = (batch + 1) * 10 // 25 - batch * 10 // 25
+        one_row.update(10, torch.full((ends,), 25.0))
+    for steps, ends in [(50, 10)] * 20 + [(100, 50)] * 2:
+        changed.update(steps, torch.full((ends,), steps / ends))
+    assert (one_row.mean, changed.mean) == (25, 2)
+
+
 @pytest.mark.parametrize(("rows", "steps"), [(30, 200), (4, 1000), (7, 130)])
 def test_where_all_episodes_have_one_length_it_is_exact(rows, steps):
     estimator = EpisodeCosts(1, max_length=1000, drift=None, decay=0.9)
@@ -87,10 +103,11 @@ def test_where_all_episodes_have_one_length_it_is_exact(rows, steps):
         assert estimator.lengths.mean == 1000
 
 
-@pytest.mark.parametrize("rows", [1, 2, 50])
-def test_the_standard_error_is_that_of_the_mean_over_many_batches(rows):
+@pytest.mark.parametrize(("rows", "alike"), [(1, 1), (2, 1), (50, 1), (50, 40)])
+def test_the_standard_error_is_that_of_the_mean_over_many_batches(rows, alike):
+    """Of steps of which so many on end are alike."""
     torch.manual_seed(rows)
-    batches = (torch.rand(4000, rows, 40, 1) < 0.1).float()
+    batches = (torch.rand(4000, rows, 40 // alike, 1) < 0.1).float().repeat_interleave(alike, 2)
     estimates = [rate_estimate(batch, torch.tensor(100.0)) for batch in batches]
     means = torch.stack([estimate.mean for estimate in estimates])
     errors = torch.stack([estimate.error for estimate in estimates])
