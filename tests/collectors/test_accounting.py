@@ -108,6 +108,9 @@ def test_agrees_with_a_loop_over_several_batches(num_envs, num_steps, done_proba
             statistics.lengths,
         ]
         torch.testing.assert_close(torch.stack(columns, -1), expected)
+        row = statistics.scalars()
+        logged = [row[f"episode_{key}"] for key in ("return", "cost", "agent/cost_speed", "length")]
+        assert logged == pytest.approx(expected.mean(0).tolist(), nan_ok=True)
         assert statistics.cost_rates["cost"].item() == pytest.approx(cost_rate)
         assert statistics.cost_rates["agent/cost_speed"].item() == pytest.approx(speed_rate)
 
@@ -153,6 +156,14 @@ def steps_of(costs, done):
     return TensorDict({"next": step}, [1, len(costs)])
 
 
+def test_a_decision_counts_as_the_steps_that_it_takes_and_the_last_as_a_whole_one():
+    steps = steps_of([1.0, 0.0, 1.0], [False, False, True])
+    steps["next", "steps_taken"] = torch.tensor([3, 3, 2]).view(1, 3, 1)
+    found = EpisodeAccounting(1, ["cost"], steps_per_decision=3).update(steps)
+    assert (found.lengths.item(), found.decisions.item(), found.steps) == (8, 3, 8)
+    assert found.cost_rates["cost"].item() == 2 / 8
+
+
 def test_costs_below_0_are_refused_with_their_name():
     accounting = EpisodeAccounting(1, ["cost"])
     with pytest.raises(EpisodeError, match=r"'cost' is below 0 in 2 of 3 steps.*0 or more"):
@@ -162,6 +173,10 @@ def test_costs_below_0_are_refused_with_their_name():
     steps["next", "cost_own"] = steps["next", "cost"]
     with pytest.raises(EpisodeError, match="'cost_own' is below 0"):  # of which it is the sum
         EpisodeAccounting(1, ["cost", "cost_own"]).update(steps)
+    steps["next", "cost"] = torch.ones(1, 1, 1)
+    with pytest.raises(EpisodeError, match="'cost_own' is below 0"):  # beside one that is not
+        EpisodeAccounting(1, ["cost", "cost_own"]).update(steps)
+    steps["next", "cost"] = steps["next", "cost_own"]
     steps["next", "of", "cost"] = steps["next"].pop("cost_own")
     with pytest.raises(EpisodeError, match="'of/cost' is below 0"):
         EpisodeAccounting(1, ["cost", ("of", "cost")]).update(steps)
