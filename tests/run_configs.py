@@ -10,6 +10,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 import safe_rl.cli.config  # noqa: F401, Hydra's ConfigStore gets the general keys
+from safe_rl.cli.config import give_limits
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF
 
@@ -33,8 +34,7 @@ def compose_config(*overrides: str) -> DictConfig:
     """Compose ``conf/config.yaml`` with command-line overrides."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=list(overrides))
-    if config.cost_limits == "default":  # as `check_settings` does, for a composed algorithm
-        config.cost_limits = config.default_cost_limits or {}
+    give_limits(config)
     return config
 
 

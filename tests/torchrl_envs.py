@@ -3,7 +3,7 @@
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, PendulumEnv
+from torchrl.envs import EnvBase, PendulumEnv, RenameTransform, TransformedEnv
 
 
 class Runner(EnvBase):
@@ -77,6 +77,11 @@ class Ends(EnvBase):
         return step.set(self._flag, self._place >= 2)
 
     def _set_seed(self, seed): ...
+
+
+def renamed():
+    """One whose own transform renames an entry."""
+    return TransformedEnv(Ends(), RenameTransform(["place"], ["spot"]))
 
 
 class Alone(PendulumEnv):

@@ -45,12 +45,13 @@ def require_limits(limits: LimitState | None) -> LimitState:
 
 def cost_surrogates(losses: TensorDictBase) -> Tensor:
     """The surrogates of the costs, [k], which constrained steps need."""
-    if losses.get("cost_surrogate", None) is None:
+    surrogates = losses.get("cost_surrogate", None)
+    if surrogates is None:
         raise ValueError(
             f"A constrained step needs a loss that returns 'cost_surrogate', such as CPOLoss; this "
             f"one returns {sorted(losses.keys())}."
         )
-    return losses["cost_surrogate"]
+    return surrogates
 
 
 class Proposal(NamedTuple):

@@ -212,6 +212,8 @@ def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
     if name == RESUMED and (key == "env" or (CONF / key).is_dir()):
         return f"{key}: a continued run keeps its {key}."
     if key.startswith("cost_limits."):
+        if any(word.startswith("cost_limits=") for word in words):
+            return f"{key}: a file has other limits. To add this one to them: +{key}=…"
         example = f"{{{key.partition('.')[2]}: 10}}"
         return f"{key}: limits are given together, cost_limits='{example}'."
     wrong = ("-", f"{given}=", f"{key}=")

@@ -194,6 +194,12 @@ _PARTS = ("critic_update", "memory", "limits", "lagrangian", "advantage", "cost_
 _NEEDED = ("loss", "policy_update", "critic_update", "advantage", "actor", "memory", "critics")
 
 
+def give_limits(config: DictConfig) -> None:
+    """Give the default limits to a configuration that has none of its own."""
+    if config.get("cost_limits") == "default":
+        config.cost_limits = config.default_cost_limits or {}
+
+
 def check_settings(config: DictConfig) -> None:
     """Check a composed configuration, before anything is built; a SettingError names a wrong key.
 
@@ -207,8 +213,7 @@ def check_settings(config: DictConfig) -> None:
         with open_dict(config):
             for name in [key for key in config if OmegaConf.is_missing(config, key)]:
                 del config[name]
-            if config.get("cost_limits") == "default":
-                config.cost_limits = config.default_cost_limits or {}
+            give_limits(config)
             if config.algo.get("constrained") is False:  # presets have limits for others
                 config.pop("limits", None)
         _check_parts(config)

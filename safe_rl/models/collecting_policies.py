@@ -202,5 +202,6 @@ class HeldActions(TensorDictModuleBase):
             if self._held is not None and not decides.all():
                 chosen = torch.where(decides, chosen, self._held)
             self._held = chosen
+        assert self._held is not None  # the first step decides
         self._taken = self._taken + 1
-        return tensordict.update(self._held)
+        return tensordict.update(self._held.copy())

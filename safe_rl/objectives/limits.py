@@ -146,11 +146,11 @@ class LimitState:
 
 
 def check_order(costs: Sequence[NestedKey], others: Sequence[NestedKey]) -> None:
-    """Refuse costs that are those of a multiplier in another order."""
+    """Refuse costs that are the others in another order: each would get the λ of another one."""
     if [*costs] != [*others] and sorted(map(str, costs)) == sorted(map(str, others)):
         raise ValueError(
-            f"The costs {[*costs]} are those of the multiplier in another order, {[*others]}: λ "
-            "would go to another cost."
+            f"The costs {[*costs]} are in another order than those with limits, {[*others]}: name "
+            "both in one order."
         )
 
 

@@ -12,7 +12,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from shlex import quote
 from signal import SIGINT, Signals
-from threading import Lock
 from typing import Any
 
 import torch
@@ -114,13 +113,13 @@ def train(
     return run
 
 
-_TRAINING = Lock()
+_TRAINED: dict[int, Run] = {}  # process -> the run that it trains; a fork trains none
 
 
 @contextmanager
 def _alone(run: Run) -> Iterator[None]:
     """Refuse to train twice at a time in one process, which has one generator of random numbers."""
-    if not _TRAINING.acquire(blocking=False):
+    if _TRAINED.setdefault(os.getpid(), run) is not run:
         raise RunInUseError(
             f"{run.directory}: this process trains a run already, and both would draw from one "
             "generator. Train one after the other, or in processes of their own, as a sweep does."
@@ -128,7 +127,7 @@ def _alone(run: Run) -> Iterator[None]:
     try:
         yield
     finally:
-        _TRAINING.release()
+        del _TRAINED[os.getpid()]
 
 
 def complete(config: DictConfig, run: Run) -> None:

@@ -141,6 +141,12 @@ def test_a_cost_within_its_limit_comes_last_however_large_its_hysteresis():
     assert metrics["recovers"][1]
 
 
+def test_a_state_of_other_limits_is_refused():
+    actor, batch = make_case()  # of two costs
+    with pytest.raises(ValueError, match="One limit for each of"):
+        c_trpo(actor)(batch, limit_state(-4.0))
+
+
 def test_at_a_limit_of_nothing_a_policy_without_costs_learns_from_its_rewards():
     actor, batch = make_case(2)
     batch["cost_advantage"] = batch["cost_advantage"] * torch.tensor([0.0, 1.0])

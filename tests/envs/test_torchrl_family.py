@@ -179,6 +179,12 @@ def test_rewards_of_integers_can_be_changed_by_transforms(trusted):
     assert env.rollout(2)["next", "reward"].flatten().tolist() == [1.0, -0.5]
 
 
+def test_an_environment_may_have_transforms_of_its_own(trusted):
+    node = RUNNER | {"id": "torchrl_envs.renamed", "cost_keys": ["cost_effort"]}
+    steps = make_env(node, num_envs=2, seed=0).rollout(2)
+    assert steps["next", "observation"][0].flatten().tolist() == [1.0, 2.0]
+
+
 def test_an_entry_that_a_step_leaves_out_is_not_that_of_an_earlier_step(trusted):
     ends = RUNNER | {"id": "torchrl_envs.Ends", "kwargs": {"silent": True}}
     env = make_env(ends, num_envs=2, seed=0)

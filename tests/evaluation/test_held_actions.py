@@ -86,9 +86,10 @@ def test_the_state_of_a_recurrent_policy_is_held_with_its_action():
     counting = TensorDictModule(
         lambda memory: (memory, memory + 1), ["memory"], ["action", ("next", "memory")]
     )
-    policy, state, taken = HeldActions(counting, k=2), torch.zeros(2, 1), []
-    for _ in range(6):
-        step = policy(TensorDict(memory=state, batch_size=[2]))
-        state = step["next", "memory"]
-        taken.append(step["action"][0].item())
-    assert taken == [0, 0, 1, 1, 2, 2]
+    policy, state, steps = HeldActions(counting, k=2), torch.zeros(2, 1), []
+    for number in range(6):
+        steps.append(policy(TensorDict(memory=state, batch_size=[2])))
+        state = steps[-1]["next", "memory"]
+        steps[-1]["next", "reward"] = torch.full((2, 1), float(number))
+    assert [step["action"][0].item() for step in steps] == [0, 0, 1, 1, 2, 2]
+    assert [step["next", "reward"][0].item() for step in steps] == [0, 1, 2, 3, 4, 5]

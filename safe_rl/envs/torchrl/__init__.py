@@ -233,7 +233,8 @@ class Rows(EnvBase):
 
 
 def _complete(make: MakeEnv) -> EnvBase:
-    return TransformedEnv(make(), CompleteSteps())
+    # around transforms of the environment's own, which change what a step writes
+    return TransformedEnv(make(), CompleteSteps(), auto_unwrap=False)
 
 
 def _alone(make: MakeEnv) -> EnvBase:
