@@ -201,9 +201,8 @@ def _picture(entry: Entry, observed: Observed, device: torch.device | None) -> n
     first, middle, last = entry.shape
     # colours are the shorter end, or the last one with at most three colours and a depth
     colours_last = last <= 4 or (middle != last and (first == middle or last < first))
-    colours = entry.shape[-1] if colours_last else entry.shape[0]
     convolutions = ConvNet(
-        in_features=colours,
+        in_features=last if colours_last else first,
         num_cells=channels,
         kernel_sizes=kernels,
         strides=strides,

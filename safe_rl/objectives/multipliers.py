@@ -100,8 +100,7 @@ class Multiplier(Checked, nn.Module, ABC):
         multiplier of this cost and its state do not change.
 
         Raises:
-            TypeError: If it is no `LimitState`.
-            ValueError: If there is not one limit per cost, in its order, or λ falls below 0.
+            TypeError, ValueError: If it is no state of one limit per cost, in order, or λ is < 0.
         """
         if not isinstance(state, LimitState):
             raise TypeError(
@@ -331,9 +330,8 @@ class PIDMultiplier(Multiplier):
         self.register_buffer("integral", initial.clone())
         for name in ("smoothed_error", "smoothed_cost"):
             self.register_buffer(name, torch.zeros_like(self.limits))
-        self.register_buffer(
-            "past_costs", torch.zeros_like(self.limits).repeat(derivative_delay, 1)
-        )
+        past = torch.zeros_like(self.limits).repeat(derivative_delay, 1)
+        self.register_buffer("past_costs", past)
 
     def _step(self, state: LimitState) -> dict[str, Tensor]:
         error = state.violation / self.scale
