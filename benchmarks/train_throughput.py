@@ -15,7 +15,7 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import safe_rl.cli.config  # noqa: F401, Hydra's ConfigStore gets the general keys
+from safe_rl.cli.config import give_limits
 from safe_rl.envs import make_env, store_configs
 from safe_rl.evaluation.loading import transforms_of
 from safe_rl.files import CONF
@@ -25,7 +25,9 @@ from safe_rl.training.building import build_trainer, seed_everything
 def compose_config(overrides):
     store_configs()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=[*overrides, "logger=none"])
+        config = compose("config", overrides=[*overrides, "logger=none"])
+    give_limits(config)
+    return config
 
 
 def new_env(config, evaluating=False):
