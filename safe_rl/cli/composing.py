@@ -143,8 +143,9 @@ def explain(error: Exception, words: Sequence[str]) -> str:
         return _absent(missing[1])
     unknown = re.match(r"Could not override '([^']+)'\.", str(error))
     if isinstance(error, ConfigCompositionException) and unknown:
-        is_group = "No match in the defaults list" in str(error) and RESUMED not in " ".join(words)
-        if is_group and unknown[1] not in General.__annotations__:
+        is_group = "No match in the defaults list" in str(error)
+        is_new = f"--config-name={RESUMED}" not in words
+        if is_group and is_new and unknown[1] not in General.__annotations__:
             return f"{unknown[1]}: nothing is chosen that it could replace; add it, +{unknown[1]}=…"
         inner = re.search(r"full_key: (\S+)", str(error.__cause__))
         return _unknown_key(inner[1] if inner else unknown[1], unknown[1], words)

@@ -233,7 +233,7 @@ class Rows(EnvBase):
 
 
 def _complete(make: MakeEnv) -> EnvBase:
-    # around transforms of the environment's own, which change what a step writes
+    """Make an environment whose steps are checked, as its own transforms have changed them."""
     return TransformedEnv(make(), CompleteSteps(), auto_unwrap=False)
 
 

@@ -150,16 +150,20 @@ class StepCosts(Transform):
 class CompleteSteps(Transform):
     """Refuses a step that lacks an entry: `SerialEnv` would repeat the one of an earlier step."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._needed: set[NestedKey] | None = None  # reading specs takes longer than a step
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         env = self.container.base_env
-        specs = (env.observation_spec, env.full_reward_spec)
-        written = set(next_tensordict.keys(True, True))
-        for key in (key for spec in specs for key in spec.keys(True, True)):
-            if key not in written:
-                raise ConfigError(
-                    f"{type(env).__name__}: a step wrote no '{dotted(key)}', which is in its specs:"
-                    " write it in every step, for example 0 where it costs nothing."
-                )
+        if self._needed is None:
+            specs = (env.observation_spec, env.full_reward_spec)
+            self._needed = {key for spec in specs for key in spec.keys(True, True)}
+        if missing := self._needed.difference(next_tensordict.keys(True, True)):
+            raise ConfigError(
+                f"{type(env).__name__}: a step wrote no '{dotted(missing.pop())}', which is in its "
+                "specs: write it in every step, for example 0 where it costs nothing."
+            )
         return next_tensordict
 
 
