@@ -200,7 +200,7 @@ class ProjectedMultiplier(Multiplier):
         *,
         init: FromZero | Sequence[FromZero],
         lr: PositiveFloat,
-        highest: PositiveFloat | None,
+        highest: AboveZero | None,
     ) -> None:
         super().__init__(cost_limits)
         self.lr, self.highest = lr, highest
@@ -249,7 +249,7 @@ class PIMultiplier(Multiplier):
         kp: NonNegativeFloat,
         ki: NonNegativeFloat,
         saturation: PositiveFloat,
-        highest: PositiveFloat,
+        highest: AboveZero,
     ) -> None:
         super().__init__(cost_limits)
         initial = per_cost("init", init, self.num_costs).clamp(0, highest)
