@@ -229,6 +229,10 @@ def filtered(function, **keys):
         ),
         (lambda: transformed(PointMass(1), o=ObservedCosts(0.5, ["coast"])), "no cost 'coast'"),
         *(
+            (lambda t=t: TransformedEnv(PointMass(1), t).rollout(1), "no cost 'coast'")
+            for t in (ObservedCosts(0.5, ["coast"]), EarlyTermination({"coast": 5.0}))
+        ),
+        *(
             (lambda key=key: filtered(half_speed, cost_key=key), f"f: cost_key={key}: choose anot")
             for key in ("cost", "cost_north", "reward")
         ),

@@ -112,7 +112,8 @@ def check_known(names: Collection[str], cost_keys: Collection[str]) -> None:
 
 
 def costs_of(step: TensorDictBase, keys: Collection[str]) -> Tensor:
-    """Return k costs of a step as float64 [..., k]."""
+    """Return k costs of a step as float64 [..., k]; ValueError for an unknown one."""
+    check_known(keys, list(filter(is_cost, step.keys())))
     return torch.cat([step[key] for key in keys], -1).double()
 
 
