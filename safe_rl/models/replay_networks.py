@@ -42,6 +42,15 @@ def _perceptron(
     return [*scaling, *([] if encoder is None else [encoder]), perceptron]
 
 
+def _action_size(low: Tensor) -> int:
+    if low.ndim != 1:
+        raise ValueError(
+            f"The bounds have the shape {list(low.shape)}, and must be those of one action, [A]: "
+            "env.action_spec_unbatched has them."
+        )
+    return len(low)
+
+
 def make_squashed_actor(
     observation_size: int,
     low: Tensor,
@@ -70,7 +79,7 @@ def make_squashed_actor(
         >>> make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]).out_keys
         ['loc', 'scale', 'action', 'action_log_prob']
     """
-    sizes = (observation_size, 2 * len(low))
+    sizes = (observation_size, 2 * _action_size(low))
     layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
     extractor = NormalParamExtractor("biased_softplus_1.0", scale_lb=_SCALE_FLOOR)
     network = Chain(*layers, extractor)
@@ -99,7 +108,7 @@ def make_bounded_actor(
         >>> make_bounded_actor(3, torch.zeros(1), torch.ones(1), hidden_sizes=[8]).out_keys
         ['action']
     """
-    sizes = (observation_size, len(low))
+    sizes = (observation_size, _action_size(low))
     layers = _perceptron(sizes, hidden_sizes, input_scale, device, encoder)
     network = Chain(*layers, _Squash(low, high, device))
     return TensorDictModule(network, in_keys=list(in_keys), out_keys=["action"])

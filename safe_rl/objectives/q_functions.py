@@ -188,14 +188,18 @@ class QFunctionLoss(ReplayLoss):
     def cached(self, key: Hashable, params: str, compute: Callable[[], Any]) -> Any:
         """What is computed from the parameters `params`, once for as long as they are there.
 
-        Others take their place in ``with others.to_module(loss)``, and if the attribute is set.
+        Others take their place in ``with others.to_module(loss)``, if the attribute is set, and if
+        a parameter gets other memory.
         """
         # TorchRL clears this cache whenever parameters move to another device or dtype
         cache = self.__dict__.setdefault("_cache", {})
-        source = getattr(self._modules.get(params), "_param_td", None)
-        known, value = cache.get(key, (None, None))
-        if known is None or known is not source:
-            cache[key] = source, (value := compute())
+        module = self._modules.get(params)
+        source = getattr(module, "_param_td", None)
+        known, leaves, places, value = cache.get(key, (None, [], [], None))
+        # after `p.data = …`, as of some optimisers, what is without gradients had the old numbers
+        if known is None or known is not source or [p.data_ptr() for p in leaves] != places:
+            leaves = [] if module is None else list(module.parameters())
+            cache[key] = source, leaves, [p.data_ptr() for p in leaves], (value := compute())
         return value
 
     def column(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:

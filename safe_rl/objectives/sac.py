@@ -58,6 +58,11 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
         action_spec: TensorSpec | None = None,
     ) -> None:
         check_ensemble(qvalue_network, "Q function of rewards")
+        if action_spec is not None and len(action_spec.shape) > 1:  # −A would be −N A
+            raise ValueError(
+                f"action_spec has the shape {list(action_spec.shape)}, and must be that of one "
+                "action, [A]: env.action_spec_unbatched."
+            )
         super().__init__(
             actor_network,
             qvalue_network,

@@ -1,5 +1,7 @@
 """Losses on Q functions against TorchRL's own, against formulas written out, and finite limits."""
 
+import copy
+
 import pytest
 import torch
 from q_losses import BOUNDS, COSTS, SAC, SPEC, TD3, lagrange, make_loss, make_q, make_steps, told
@@ -15,6 +17,7 @@ from safe_rl.models import make_bounded_actor, make_squashed_actor
 from safe_rl.objectives import (
     LagrangeMultiplier,
     SACLagrangianLoss,
+    SACLoss,
     TD3Loss,
 )
 
@@ -85,6 +88,22 @@ def test_scripts_of_torchrls_td3_find_the_two_losses():
             torch.manual_seed(1)
             found.append(getattr(module, name)(steps.clone())[0])
         torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("kind", ["sac", "td3"])
+def test_parameters_that_get_other_memory_are_those_of_all_losses(kind):
+    """As `p.data = …` and `vector_to_parameters` do."""
+    loss, steps = make_loss(kind, lagrange(2.0, 3.0)), make_steps()
+    told(loss, [1.0, 0.5], rewards=[-0.25, 0.25])
+    loss.actor_losses(steps)
+    for network in (loss.qvalue_network, loss.cost_qvalue_network):
+        vector = nn.utils.parameters_to_vector(network.parameters())
+        nn.utils.vector_to_parameters(3.0 * vector, network.parameters())
+    losses = []
+    for each in (loss, copy.deepcopy(loss)):  # a copy has nothing that was kept
+        torch.manual_seed(1)
+        losses.append(each.actor_losses(steps)["loss_actor"])
+    torch.testing.assert_close(*losses)
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
@@ -206,6 +225,12 @@ def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=["cost"], **SAC)
     with pytest.raises(ValueError, match="another order"):
         SACLagrangianLoss(*networks, make_q(), multiplier=multiplier, cost_keys=COSTS[::-1], **SAC)
+    batched = SPEC.expand(50, *SPEC.shape)
+    with pytest.raises(ValueError, match=r"\[50, 2\], and must be .*action_spec_unbatched"):
+        SACLoss(*networks, action_spec=batched, gamma=0.9, alpha_init=0.1)
+    for make in (make_squashed_actor, make_bounded_actor):
+        with pytest.raises(ValueError, match=r"\[50, 2\], and must be .*action_spec_unbatched"):
+            make(3, batched.low, batched.high, hidden_sizes=[8])
     with pytest.raises(ValueError, match="One limit for each of"):
         told(make_loss("sac", multiplier, is_prepared=False), [1.0], rewards=[1.0])
 
