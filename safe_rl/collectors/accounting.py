@@ -207,8 +207,8 @@ class EpisodeAccounting(Resumable):
             KeyError: If a key is not in the batch.
             EpisodeError: If a cost is below 0, or an episode too long.
             FloatingPointError: If an observation, action, reward or cost is NaN or infinite.
-            ValueError: If the batch has another shape, does not continue the last one, or an entry
-                is not one number per step.
+            ValueError: If the batch has another shape, padding, or steps that do not follow each
+                other or the last batch, or an entry is not one number per step.
         """
         num_envs = self.open_sums.shape[0]
         if batch.ndim == num_envs == 1:
@@ -219,7 +219,8 @@ class EpisodeAccounting(Resumable):
                 f"environments: it needs [{num_envs}, T], as the collector returns it (of several "
                 "workers with cat_results=0)."
             )
-        self._check_continues(batch)
+        done = self._column(batch, self.done_key).long()
+        self._check_continues(batch, done)
         columns = {key: self._column(batch, key) for key in self._signal_keys}
         observed = batch.select("observation", ("next", "observation"), strict=False)
         # actions last: a policy that observes NaN acts with NaN
@@ -232,7 +233,7 @@ class EpisodeAccounting(Resumable):
             num_steps = int(steps.sum())
         signals = torch.cat([steps.unsqueeze(-1), signals], -1)
         before = self.open_sums[:, 2:]
-        finished = self._close_episodes(signals, self._column(batch, self.done_key).long())
+        finished = self._close_episodes(signals, done)
         finished = finished[finished[:, 0].isfinite()]
         longest = torch.cat([finished[:, 0], self.open_sums[:, 0]]).nan_to_num().max().item()
         if self.longest is not None and longest > self.longest:
@@ -255,26 +256,34 @@ class EpisodeAccounting(Resumable):
             steps=num_steps,
         )
 
-    def _check_continues(self, batch: TensorDictBase) -> None:
-        """Refuse a batch that is not of the same episodes as the end of the last one."""
+    def _check_continues(self, batch: TensorDictBase, done: Tensor) -> None:
+        """Refuse padding, and steps that are not of the same episodes as those before them."""
+        mask = batch.get(("collector", "mask"), None)
+        if mask is not None and not mask.all():
+            raise ValueError(
+                "The batch has padding, which would count as steps: use the collector with "
+                "split_trajs=False."
+            )
         ids = batch.get(("collector", "traj_ids"), None)
         if ids is None:
             return
         ids = ids.reshape(batch.shape)
-        if self._last_ids is not None:
-            is_another, goes_on = ids[:, 0] != self._last_ids, self.have_begun
-            if (is_another & goes_on).any():
-                raise ValueError(
-                    "This batch does not continue the episodes of the last one: steps of several "
-                    "episodes would be summed up as one. An asynchronous collector returns batches "
-                    "of its workers in turn: use MultiSyncCollector with cat_results=0. If the "
-                    "environments have been reset, call forget_open_episodes() before."
-                )
-            if not (is_another | goes_on).all():
-                raise ValueError(
-                    "Episodes go on that had ended ('done') in the last batch: use the collector "
-                    "with set_truncated=False."
-                )
+        last = ids[:, 0] if self._last_ids is None else self._last_ids
+        is_another = ids != torch.cat([last.unsqueeze(1), ids[:, :-1]], 1)
+        goes_on = torch.cat([self.have_begun.unsqueeze(1), done[:, :-1] == 0], 1)
+        if (is_another & goes_on).any():
+            raise ValueError(
+                "Steps do not continue the episodes of those before them, in this batch or the "
+                "last one: several episodes would be summed up as one. An asynchronous collector "
+                "returns batches of its workers in turn: use MultiSyncCollector with "
+                "cat_results=0. If the environments have been reset, call forget_open_episodes() "
+                "before."
+            )
+        if self._last_ids is not None and not (is_another | goes_on)[:, 0].all():
+            raise ValueError(
+                "Episodes go on that had ended ('done') in the last batch: use the collector with "
+                "set_truncated=False."
+            )
         self._last_ids = ids[:, -1].clone()
 
     def _close_episodes(self, signals: Tensor, done: Tensor) -> Tensor:

@@ -64,10 +64,22 @@ def test_batches_of_other_episodes_than_those_that_are_open_are_refused():
     accounting.update(batch([4, 4, 4], [False, False, False]))
     accounting.update(batch([4, 7, 7], [True, False, True]))
     assert accounting.update(batch([9, 9, 9], [False] * 3)).lengths.tolist() == []
-    with pytest.raises(ValueError, match=r"does not continue the episodes.* cat_results=0"):
-        accounting.update(batch([8, 8, 8], [True] * 3))
+    for ids, ends in (([8, 8, 8], [True] * 3), ([9, 8, 8], [False, False, True])):
+        with pytest.raises(ValueError, match=r"do not continue the episodes.* cat_results=0"):
+            accounting.update(batch(ids, ends))
     accounting.forget_open_episodes()
     assert accounting.update(batch([8, 8, 8], [False, False, True])).lengths.tolist() == [3.0] * 2
+
+
+def test_padding_is_no_step():
+    batch = random_batch(torch.Generator().manual_seed(0), 2, 4, 0.2)
+    for real in (torch.tensor([[True] * 4, [True] * 3 + [False]]), torch.ones(2, 4) > 0):
+        batch["collector", "mask"] = real
+        if real.all():
+            EpisodeAccounting(2, COST_KEYS).update(batch)
+        else:
+            with pytest.raises(ValueError, match=r"padding.* split_trajs=False"):
+                EpisodeAccounting(2, COST_KEYS).update(batch)
 
 
 def test_ends_of_batches_that_are_no_ends_of_episodes_are_refused():
