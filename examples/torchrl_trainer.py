@@ -57,7 +57,7 @@ class Parts:
         )
         self.accounting = EpisodeAccounting(env.batch_size.numel(), keys, device=env.device)
         self.collector = make_collector(env, self.actor, frames_per_batch=frames_per_batch)
-        self.constraints = Constraints(limits)
+        self.constraints = Constraints(limits, max_length=env.max_episode_steps)
 
     def add_limits(
         self,

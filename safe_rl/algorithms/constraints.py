@@ -9,7 +9,7 @@ from typing import Self
 
 import torch
 from omegaconf import DictConfig
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -33,11 +33,13 @@ class Constraints(Resumable):
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.
         max_length: Largest length of an episode in time steps of a batch. Without a tracker, it is
-            the mean length until an episode has finished; None takes the length of the batch.
+            the mean length until an episode has finished; with None nothing is known until then
+            (NaN).
         tracker: Tracker that estimates J_c and computes its current target, or None.
         risk: Risk measure that is limited instead of the mean cost of an episode, or None. It needs
             a tracker.
         device: Device of the state.
+        done_key: Key below ``next`` of the ends of episodes, which a risk measure needs.
 
     Attributes:
         keys: Keys of the k costs.
@@ -66,6 +68,7 @@ class Constraints(Resumable):
         tracker: LimitTracker | None = None,
         risk: RiskMeasure | None = None,
         device: torch.device | str | None = None,
+        done_key: NestedKey = "done",
     ) -> None:
         if risk is not None and tracker is None:
             raise ValueError(
@@ -80,7 +83,7 @@ class Constraints(Resumable):
         if risk is not None:
             self.state_names = ("tracker", "risk")
         self.schedule = tracker.schedule if tracker is not None and self.keys else ""
-        self._max_length = max_length
+        self._max_length, self._done_key = max_length, unravel_key(("next", done_key))
         # mean costs and length of episodes in the last batch in which an episode finished
         self.finished = torch.full_like(self.limits, torch.nan)
         self.mean_length = torch.full((), torch.nan, device=device)
@@ -144,7 +147,7 @@ class Constraints(Resumable):
             )
         costs = torch.cat(columns, -1)
         if self.risk is not None:
-            steps, ends = costs.cpu(), batch["next", "done"].squeeze(-1).cpu()
+            steps, ends = costs.cpu(), batch[self._done_key].squeeze(-1).cpu()
             before = torch.stack([episodes.open_costs[key_name(key)] for key in self.keys], -1)
             finished = episodes.episode_costs(self.keys).cpu()
             self._measured = self.risk(steps, ends, before.to(steps), finished)
@@ -166,7 +169,7 @@ class Constraints(Resumable):
         if not has_finished:
             length = torch.full_like(length, float(self._max_length or batch.shape[-1]))
         goes_by_rate = batch.shape[-1] < float(length)
-        if self.keys and (goes_by_rate or not has_finished):
+        if self.keys and (goes_by_rate or not has_finished) and (has_finished or self._max_length):
             rates = [batch["next", key].to(costs).mean() for key in self.keys]
             costs = torch.stack(rates) * length
         is_new = goes_by_rate or episodes.num_episodes > 0

@@ -13,6 +13,7 @@ from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import (
     CostGAE,
     CriticLoss,
+    CVaR,
     LagrangeMultiplier,
     LimitTracker,
     PPOLagrangianLoss,
@@ -94,7 +95,13 @@ def tracked(at):
     return Constraints({at("cost"): 1.0}, tracker=LimitTracker(torch.tensor([1.0]), **TRACKER))
 
 
-@pytest.mark.parametrize("constraints_of", [plain, tracked])
+def risky(at):
+    tracker = LimitTracker(torch.tensor([1.0]), **TRACKER)
+    risk = CVaR(torch.tensor([1.0]), tail=0.5, window=10)
+    return Constraints({at("cost"): 1.0}, tracker=tracker, risk=risk, done_key=at("done"))
+
+
+@pytest.mark.parametrize("constraints_of", [plain, tracked, risky])
 def test_entries_below_another_one_are_learned_from_as_at_the_root(constraints_of):
     rows, learned, advantages = [], [], []
     for below in ((), ("agents",)):

@@ -240,6 +240,18 @@ def test_a_loop_of_ones_own_is_told_of_a_limit_below_zero():
         LimitState.of(cost=[31.0, 2.0], limit=[25.0])
 
 
+def test_without_a_length_nothing_is_known_until_an_episode_has_finished():
+    """The costs of a short batch are a part of an episode's."""
+    batch = TensorDict({"next": {"cost": torch.full((3, 5, 1), 0.5)}}, [3, 5])
+    open_episodes = EpisodeStatistics(NO_EPISODES, {"cost": NO_EPISODES}, NO_EPISODES, {})
+    multiplier = ProjectedMultiplier({"cost": 25.0}, init=0.5, lr=0.01, highest=None)
+    for length, violation in ((None, torch.nan), (100, 25.0)):
+        state = Constraints({"cost": 25.0}, max_length=length).update(batch, open_episodes)
+        assert state.violation.item() == pytest.approx(violation, nan_ok=True)
+        multiplier.update(state)
+        assert (multiplier.value == 0.5).all() == (length is None)
+
+
 def test_batches_of_one_environment_need_their_dimension():
     batch = TensorDict(next={"cost": torch.ones(5, 1)}, batch_size=[5])
     with pytest.raises(ValueError, match=r"shape \[5\].*batch\.unsqueeze\(0\)"):
