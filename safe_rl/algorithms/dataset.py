@@ -138,9 +138,10 @@ def _fill(
         )
     costs = [("next", key) for key in env.cost_keys if ("next", key) in steps.keys(True)]
     check_steps({key: steps[key] for key in {*buffer.in_keys, *costs}}, costs)
+    warning = _order_columns(steps, interface, node, env)
     if not is_recorded:
         _check_costs_and_ends(steps, env)
-    warning = _order_columns(steps, interface, node, env)
+        warning += _smaller_actions(steps["action"], env)
     number = steps.batch_size.numel()
     if node.safe_episodes:
         if missing := [key for key in limits if ("next", key) not in steps.keys(True)]:
@@ -248,6 +249,18 @@ def _in_units_of_policy(
         action = _rescaled(action, recorded[:2], recorded[2:])
     _check_bounds(action, *raw)
     return _rescaled(action, raw, chosen).clamp(*chosen)
+
+
+def _smaller_actions(action: Tensor, env: EnvBase) -> str:
+    """A warning if actions of a file look as if they had been scaled to [-1, 1]; or ""."""
+    low, high = (bound.flatten() for bound in env.action_bounds)
+    if not ((low < -1) & (high > 1)).any() or action.abs().max() > 1:
+        return ""
+    return (
+        f" Warning: its actions are all within -1 and 1, and the bounds of this environment are "
+        f"{low.min():g} and {high.max():g}. They are used as they are: rescale them if they were "
+        "scaled."
+    )
 
 
 def _recorded_bounds(interface: Mapping[str, Any], otherwise: list[Tensor]) -> list[Tensor]:

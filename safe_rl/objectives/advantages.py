@@ -220,7 +220,8 @@ class CostGAE(VectorGAE):
     """`VectorGAE` for k costs: writes ``cost_advantage``, ``cost_value_target``, ``cost_value``.
 
     Args:
-        cost_keys: Keys of the costs under ``"next"``, in the order of the k outputs.
+        cost_keys: Keys of the costs under ``"next"``, in the order of the k outputs and of the
+            limits: columns have no names, so another order is not noticed.
         value_network: Cost critic, which writes ``cost_value`` [..., T, k]; None: see `VectorGAE`.
         settings: ``gamma``, ``lmbda`` and ``value_target``, see `VectorGAE`.
 

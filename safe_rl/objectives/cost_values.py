@@ -179,8 +179,8 @@ class QuantileCosts(CostValues):
 
     Dabney, Rowland, Bellemare, Munos, *Distributional Reinforcement Learning with Quantile
     Regression* (AAAI 2018). Quantile i is that of the level τ_i = (i − ½) / N. Each is compared
-    with all target quantiles c + γ q_j' by their equation 10, the Huber loss of the difference,
-    weighed by τ_i or 1 − τ_i.
+    with all target quantiles c + γ q_j' by their equation 10, divided by κ: the Huber loss of the
+    difference, weighed by τ_i or 1 − τ_i.
 
     Args:
         number: Number N of quantiles.

@@ -251,7 +251,8 @@ class SurrogateLoss(Checked, SharesTensors):
 class WeighsCosts(SurrogateLoss):
     """Mixin for a policy loss without costs: adds costs, weighted by λ / u.
 
-    u is the typical size of one cost (`LimitState.unit`), 1 before `prepare`.
+    u is the typical size of one cost (`LimitState.unit`), 1 before `prepare` and after one without
+    limits.
 
     Args:
         actor_network: Policy with `get_dist`; see `SurrogateLoss`.
