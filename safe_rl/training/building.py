@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -28,7 +27,7 @@ from safe_rl.collectors.workers import MakeEnv, check_batch
 from safe_rl.envs import make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import node_of, transforms_of
-from safe_rl.runs.checkpoints import check_interface, read_facts, read_states
+from safe_rl.runs.checkpoints import CheckpointStore, check_interface, read_facts
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
@@ -173,7 +172,7 @@ def begin_from(
 
     Raises:
         CheckpointError: If there is no checkpoint, it lacks a network, or its networks have other
-            shapes or were trained on other observations. Then nothing has been changed.
+            shapes or were trained on other observations.
     """
     source = Path(config["init_from"]).expanduser()
     if not source.exists():
@@ -188,57 +187,34 @@ def begin_from(
         check_interface(checkpoint, interface)
         for warning in _other_actions(read_facts(checkpoint).get("interface"), interface):
             print(warning)
-    same_costs = _cost_critics(checkpoint) == (list(algorithm.cost_keys), estimated(config))
+    run = Run(run_of(checkpoint)[0])
+    same_costs = estimated(config) == estimated(run.settings if run.is_run else {})
     taken = {
         name: network
         for name, network in algorithm.networks.items()
         if same_costs or name not in algorithm.cost_networks
     }
-    weights = read_states(checkpoint)
-    if absent := [name for name in taken if name not in weights]:
+    try:
+        CheckpointStore.load(checkpoint, taken)
+    except CheckpointError as error:
         raise CheckpointError(
-            f"{checkpoint} has no {' and no '.join(absent)}, which this run needs: init_from takes "
-            "a run that has trained all networks of this one: algo=bc and exported policies have "
-            "only the actor."
-        )
-    for name, network in taken.items():
-        _check_shapes(name, network.state_dict(), weights[name], checkpoint)
-    for name, network in taken.items():
-        network.load_state_dict(weights[name])
+            f"{error} init_from needs a run that has trained all networks of this one (algo=bc and "
+            "exported policies have only the actor), with the same observations, actions and kind "
+            "of algorithm (on-policy, SAC or TD3). Set model.… and critics.… as in its config.yaml."
+        ) from error
     algorithm.networks_replaced()
     return list(taken)
 
 
-def _cost_critics(checkpoint: Path) -> tuple[list[str], tuple[Any, Any]]:
-    """Cost keys of the cost critic in a checkpoint, empty if unknown, and what it estimates."""
-    run = Run(run_of(checkpoint)[0])
-    config = run.settings if run.is_run else {}
-    is_constrained = (config.get("algo") or {}).get("constrained", False)
-    costs = list(config.get("cost_limits", {})) if is_constrained else []
-    return costs, estimated(config)
-
-
-def estimated(config: Mapping[str, Any]) -> tuple[Any, Any]:
-    """What decides which measure cost critics estimate: the risk, and the loss of Q functions."""
+def estimated(config: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What decides what cost critics estimate: costs, risk, and the loss of Q functions."""
+    is_constrained = (config.get("algo") or {}).get("constrained") is not False
     has_q_functions = isinstance(config.get("critics"), Mapping)
-    loss = (config.get("loss") or {}).get("_target_") if has_q_functions else None
     risk = config.get("risk") or {}
     # with risk=mean the section may still have numbers
     read = ("_target_", "tail", "most_over") if risk.get("_target_") else ()
-    return {key: risk.get(key) for key in read}, loss
-
-
-def _check_shapes(
-    name: str, network: Mapping[str, Any], given: Mapping[str, Any], checkpoint: Path
-) -> None:
-    here, there = (
-        {key: tuple(value.shape) for key, value in weights.items() if isinstance(value, Tensor)}
-        for weights in (network, given)
+    return (
+        list(config.get("cost_limits") or ()) if is_constrained else [],
+        {key: risk.get(key) for key in read},
+        (config.get("loss") or {}).get("_target_") if has_q_functions else None,
     )
-    if other := next((key for key in here | there if here.get(key) != there.get(key)), None):
-        raise CheckpointError(
-            f"The {name} of {checkpoint} does not fit this run's: the shape of {other} is "
-            f"{there.get(other, 'absent')} there and {here.get(other, 'absent')} here. init_from "
-            "needs a run with the same observations, actions and kind of algorithm (on-policy, SAC "
-            "or TD3). Set model.… and critics.… as in its config.yaml."
-        )
