@@ -9,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from shlex import quote
 from signal import SIGINT, Signals
@@ -85,11 +86,11 @@ def train(
     # Python shows the outcome of the run that is returned
     run, say = Run(directory), print_line if program else lambda line: None
     complete(config, run)
-    again = _command_again(run, config, program)
+    again = partial(_command_again, run, config, program)
     with _ending_cleanly(run, config), _alone(run), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
-            print(f"{done}. To train on: {_longer(again, 2 * max(run.steps, config.frames))}")
+            print(f"{done}. To train on: {again(2 * max(run.steps, config.frames))}")
             with closing(make_env(node_of(run, config), num_envs=1)) as env:
                 stopped_by, length = None, env.max_episode_steps
         else:
@@ -107,7 +108,7 @@ def train(
                 raise
             stopped_by, length = trainer.stopped_by, trainer.env.max_episode_steps
             if not trainer.is_finished:
-                end_by(stopped_by, f"Interrupted. Continue with: {again}")
+                end_by(stopped_by, f"Interrupted. Continue with: {again()}")
         if is_to_keep_limits(config):
             certify_finished(run, config, length, stopped_by=stopped_by, again=again, say=say)
     return run
@@ -139,18 +140,17 @@ def complete(config: DictConfig, run: Run) -> None:
         config.env = complete_env(node_of(run, config)) | known
 
 
-def _command_again(run: Run, config: DictConfig, program: str | None) -> str:
-    """The command that continues a run."""
+def _command_again(
+    run: Run, config: DictConfig, program: str | None, frames: int | None = None
+) -> str:
+    """The command that continues a run, or the call in Python, with ``frames`` if given."""
+    more = [] if frames is None else [f"frames={frames:_}"]
     if program is not None:
-        return f"{program}{import_words(config)} resume={quote(str(run.directory))}"
+        words = [f"{program}{import_words(config)}", f"resume={quote(str(run.directory))}", *more]
+        return " ".join(words)
     modules = list(config.get("import") or [])
-    return f"safe_rl.resume({str(run.directory)!r}{f', imports={modules}' if modules else ''})"
-
-
-def _longer(again: str, frames: int) -> str:
-    """The command that continues a run, or the call in Python, with more frames."""
-    is_call = again.endswith(")")
-    return f"{again[:-1]}, frames={frames:_})" if is_call else f"{again} frames={frames:_}"
+    imports = [f"imports={modules}"] if modules else []
+    return f"safe_rl.resume({', '.join([repr(str(run.directory)), *imports, *more])})"
 
 
 @contextmanager
@@ -174,7 +174,7 @@ def _ending_cleanly(run: Run, config: DictConfig) -> Iterator[None]:
         raise
 
 
-def _check_is_free(run: Run, again: str, key: str) -> None:
+def _check_is_free(run: Run, again: Callable[[], str], key: str) -> None:
     """Refuse a folder with files that a new run would replace."""
     # of a run, of an exported policy, or the user's own
     places = (run.table_file, run.config_file, run.checkpoints_folder, run.robot_folder)
@@ -183,7 +183,7 @@ def _check_is_free(run: Run, again: str, key: str) -> None:
         raise FileExistsError(f"The run would replace {taken[0]}: give it another folder, {key}=…")
     if taken:
         raise FileExistsError(
-            f"{run.directory} already holds a run. Continue it with: {again}; or give this one "
+            f"{run.directory} already holds a run. Continue it with: {again()}; or give this one "
             f"another folder, {key}=…"
         )
 
@@ -268,14 +268,15 @@ def certify_finished(
     length: int,
     *,
     stopped_by: Signals | None,
-    again: str,
+    again: Callable[..., str],
     say: Callable[[str], None],
 ) -> None:
     """Certify a finished run that is to keep limits, unless it is short or tested already.
 
     A tested one is tested again if the configuration has other options for the test. `length` is
     T_ep, steps of a full episode. `stopped_by`, a signal that has come in the last epoch, ends the
-    process before the test. `again` is the command that continues the run; `say` prints a line.
+    process before the test. `again` returns the command that continues the run, also with more
+    frames; `say` prints a line.
     """
     # steps of a test that stops early, after a fifth of its episodes
     steps = int(config.certificate.episodes * length / 5)
@@ -287,23 +288,20 @@ def certify_finished(
     has_same_options = is_unchanged or has_options(certificate, certificate_options(config))
     if not steps or (is_tested and has_same_options):
         return
+    reason = None
     if not has_tested_measure(config):
-        say(
-            f"Not certified: there is no test for limits on {measure_of(config)}. For a "
-            "certificate of the mean cost: safe-rl evaluate "
-            f"{quote(str(run.directory))} certify=true{import_words(config)}"
+        reason = f"there is no test for limits on {measure_of(config)}. For one of the mean cost"
+    elif steps > whole_frames(config):
+        reason = (
+            f"frames={config.frames:_} are fewer than {steps:,}, a fifth of the steps of "
+            f"certificate.episodes={config.certificate.episodes} episodes. To make one all the same"
         )
-        return
-    if steps > whole_frames(config):
+    if reason is not None:
         given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
-        say(
-            f"Not certified: frames={config.frames:_} are fewer than {steps:,}, a fifth of the "
-            f"steps of certificate.episodes={config.certificate.episodes} episodes. To make a "
-            "certificate all the same: safe-rl evaluate "
-            f"{quote(str(run.directory))} certify=true{given}{import_words(config)}"
-        )
+        command = f"safe-rl evaluate {quote(str(run.directory))} certify=true{given}"
+        say(f"Not certified: {reason}: {command}{import_words(config)}")
         return
-    later = f"Interrupted before it was certified. To do so: {again}"
+    later = f"Interrupted before it was certified. To do so: {again()}"
     end_by(stopped_by, later)
     threads, changes = config.num_threads or 0, config.certificate
     try:
@@ -312,7 +310,7 @@ def certify_finished(
         return end_by(SIGINT, later)
     say(str(result))
     if result is not None and result.checkpoint is None and result.may_need_training:
-        say(f"To train on: {_longer(again, 2 * config.frames)}")
+        say(f"To train on: {again(2 * config.frames)}")
 
 
 def import_words(config: DictConfig) -> str:

@@ -44,7 +44,7 @@ def test_it_trains_with_several_costs(tmp_path):
         expected = [estimate - limit for estimate in table[f"estimate_{key}"]]
         assert table[f"violation_{key}"] == pytest.approx(expected, abs=1e-5)
     run, said = Run(tmp_path), []
-    certify_finished(run, run.config, 25, stopped_by=None, again="", say=said.append)
+    certify_finished(run, run.config, 25, stopped_by=None, again=str, say=said.append)
     assert said[0].startswith("Not certified: there is no test for limits on UpperSemideviation.")
     own = OmegaConf.merge(run.config, {"risk": {"tail": 0.2}})
     assert certificate_options(own).tail == 1.0
