@@ -18,6 +18,7 @@ from safe_rl.algorithms.processor_use import fast_products, torch_threads
 from safe_rl.checks import SettingError
 from safe_rl.collectors import EpisodeAccounting, Recording, WorkerCollector
 from safe_rl.runs.checkpoints import CheckpointStore
+from safe_rl.runs.table import read_table
 from safe_rl.runs.writing import RunWriter
 from safe_rl.training.checkpoint_selection import CheckpointSelection
 from safe_rl.training.state import (
@@ -185,8 +186,9 @@ class Trainer:
             if not self.progress.epoch:
                 self._checkpoints.begin()
             else:
-                for row in self.writer.rows():
-                    self._selection.take(row)
+                table = read_table(self.writer.run.table_file)
+                for values in zip(*table.values(), strict=True):
+                    self._selection.take(dict(zip(table, values, strict=True)))
                 # if the run was shorter before, these were scored by fewer epochs at its end
                 self._checkpoints.forget_best(policy["steps"] for policy in self._selection.waiting)
             while self.progress.steps < self._config.frames:

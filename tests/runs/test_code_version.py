@@ -9,9 +9,9 @@ import pytest
 
 import safe_rl
 from safe_rl.reporting.tables import read_code
-from safe_rl.runs import code_version
-from safe_rl.runs.code_version import code_of, note_code
+from safe_rl.runs import writing
 from safe_rl.runs.run import Run
+from safe_rl.runs.writing import code_of, note_code
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_a_package_within_somebody_elses_checkout_has_no_commit(checkout):
 def test_the_commits_of_the_users_modules_are_noted(checkout, tmp_path, monkeypatch):
     module, git = checkout
     monkeypatch.setitem(sys.modules, "theirs", SimpleNamespace(__file__=str(module)))
-    monkeypatch.setattr(code_version, "allowed", lambda: ["theirs"])
+    monkeypatch.setattr(writing, "allowed", lambda: ["theirs"])
     path = tmp_path / "code.json"
     note_code(path, 0)
     (entry,) = json.loads(path.read_text())
@@ -82,7 +82,7 @@ def test_the_commits_of_the_users_modules_are_noted(checkout, tmp_path, monkeypa
 
 def test_without_git_a_run_is_noted_all_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(code_version, "allowed", list)  # not the modules of other tests
+    monkeypatch.setattr(writing, "allowed", list)  # not the modules of other tests
     code_of.cache_clear()
     note_code(tmp_path / "code.json", 0)
     code_of.cache_clear()
@@ -95,7 +95,7 @@ def test_code_that_resumes_a_run_stands_below_what_began_it(tmp_path, monkeypatc
 
     def noted(commit, steps):
         known = {"version": "1", "commit": commit, "changed": False}
-        monkeypatch.setattr(code_version, "code_of", lambda file: known)
+        monkeypatch.setattr(writing, "code_of", lambda file: known)
         note_code(path, steps)
         return [(entry["steps"], entry["commit"]) for entry in json.loads(path.read_text())]
 
