@@ -151,23 +151,16 @@ def lock_folder(file: Path) -> Iterator[None]:
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-        if lock.lock_counter == 1:
-            _remove_unfinished(directory)
+        unfinished = paths_below(directory, ".*") if lock.lock_counter == 1 else ()
+        for path in filter(is_unfinished, unfinished):
+            with suppress(FileNotFoundError):
+                is_old = time.time() - path.stat().st_mtime > _DAY
+                # an evaluation writes without the lock: what it may be writing now stays for a day
+                if is_old or not path.name.startswith(".evaluation"):
+                    path.unlink()
         yield
 
 
 def is_unfinished(path: Path) -> bool:
     """Whether a file is one that `safe_rl.files.replacing` has not finished to write."""
     return _UNFINISHED.fullmatch(path.name) is not None and path.is_file()
-
-
-def _remove_unfinished(directory: Path) -> None:
-    """Remove what a killed process had not finished to write.
-
-    An evaluation writes without the lock, so what it may be writing now stays for a day.
-    """
-    for path in filter(is_unfinished, paths_below(directory, ".*")):
-        with suppress(FileNotFoundError):
-            is_old = time.time() - path.stat().st_mtime > _DAY
-            if is_old or not path.name.startswith(".evaluation"):
-                path.unlink()

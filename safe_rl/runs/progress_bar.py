@@ -74,21 +74,14 @@ def shown(
         return {"episodes": "none has ended"}
     figures = {"return": f"{row['episode_return']:.2f}"}
     for key in list(limits) or ["cost"]:
-        value = measured(row, key, limits.get(key), measure)
-        figures[key] = f"{value:.1f}{_present_limit(row, key, limits)}"
+        limit, target = limits.get(key), row.get(f"target_{key}", -math.inf)
+        figures[key] = f"{measured(row, key, limit, measure):.1f}"
+        if limit is not None and target <= limit:
+            figures[key] += f"/{limit:g}"
+        elif limit is not None:
+            has_no_limit = target > row.get(f"estimate_{key}", math.inf)
+            figures[key] += " (no limit yet)" if has_no_limit else f"/target {target:.3g}"
     multipliers = [value for name, value in row.items() if name.startswith("multiplier_")]
     if multipliers:
         figures["λ"] = " ".join(f"{value:.3g}" for value in multipliers)
     return figures
-
-
-def _present_limit(row: Mapping[str, float], key: str, limits: Mapping[str, float]) -> str:
-    """The present limit of a cost, to follow its figure."""
-    if key not in limits:
-        return ""
-    target, limit = row.get(f"target_{key}", -math.inf), limits[key]
-    if target <= limit:
-        return f"/{limit:g}"
-    if target > row.get(f"estimate_{key}", math.inf):
-        return " (no limit yet)"
-    return f"/target {target:.3g}"

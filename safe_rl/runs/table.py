@@ -52,7 +52,14 @@ class TableWriter:
         self._columns: list[str] | None = None
         kept: list[str] = []
         if keep_rows:
-            kept = _first_rows(path, keep_rows)
+            kept = _complete_lines(path)[: keep_rows + 1] if path.exists() else []
+            if len(kept) <= keep_rows:
+                raise TableError(
+                    f"{path} holds {max(0, len(kept) - 1)} complete rows, but the run that is to "
+                    f"be continued has finished {keep_rows} epochs: the table has been changed or "
+                    "cut off. Restore it to continue, or begin a new run from the networks with "
+                    "init_from=."
+                )
             self._columns = list(_columns_of(path, kept))
         # replaced atomically: a run killed here still has its table
         replace_text(path, "".join(kept))
@@ -72,18 +79,6 @@ class TableWriter:
             )
         with self._path.open("a", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(lines)
-
-
-def _first_rows(path: Path, number: int) -> list[str]:
-    """Lines of a table: the header and the first ``number`` rows."""
-    complete = _complete_lines(path) if path.exists() else []
-    if len(complete) < number + 1:
-        raise TableError(
-            f"{path} holds {max(0, len(complete) - 1)} complete rows, but the run that is to be "
-            f"continued has finished {number} epochs: the table has been changed or cut off. "
-            "Restore it to continue, or begin a new run from the networks with init_from=."
-        )
-    return complete[: number + 1]
 
 
 def _complete_lines(path: Path) -> list[str]:
