@@ -42,19 +42,17 @@ class Run(folders.Run):
     """A run of a report; ``notes`` are ``overrides``, ``certificate`` … as in its files.
 
     Attributes:
-        takes_part: Whether it counts as finished before it has reached its end.
         source: Name of the baselines that it belongs to; "" for a run of the report itself.
     """
 
     notes: Mapping[str, Any]
-    takes_part: bool = False
     source: str = ""
 
     @cached_property
     def overrides(self) -> list[str] | None:
         """Overrides of its command line, or None if they are not recorded."""
         given = self.notes.get("overrides")
-        return list(map(clean, given)) if isinstance(given, list) else None
+        return [clean(word, 10_000) for word in given] if isinstance(given, list) else None
 
     def check(self) -> None:
         """Refuse a run that lacks what a report needs.
@@ -63,9 +61,8 @@ class Run(folders.Run):
             ValueError: If the configuration or the table lacks something.
             Exception: Of any type, if notes are not as a run writes them.
         """
-        given = {**self.settings, "cost_limits": self.settings.get("cost_limits") or {}}
-        wrong = [*unusable_keys(given), *(["frames"] if "frames" not in given else [])]
-        if wrong:
+        limits = self.settings.get("cost_limits") or {}
+        if wrong := unusable_keys({"frames": None, **self.settings, "cost_limits": limits}):
             raise ValueError(
                 f"config.yaml is not that of a run: it lacks a usable {', '.join(wrong)}"
             )
@@ -90,26 +87,15 @@ class Run(folders.Run):
     @property
     def length(self) -> int:
         """The configured number of environment steps; for an unfinished run, those so far."""
-        configured = self.settings["frames"]
-        return int(configured) if 0 < configured <= self.steps else self.steps
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether it counts as finished."""
-        return self.takes_part or super().is_finished
+        return min(int(self.settings["frames"]) or self.steps, self.steps)
 
     @property
     def repeating(self) -> str | None:
         """The command that repeats it, or None if its overrides are not recorded."""
         if self.overrides is None:
             return None
-        folders, changed = map(clean, self.notes.get("config_dirs", ())), self.changed
-        return repeating(self.overrides, folders, {clean(k): v for k, v in changed.items()})
-
-    @property
-    def changed(self) -> dict[str, Any]:
-        """Settings that ``resume=`` has changed, by dotted keys."""
-        return dict(self.notes.get("changed", {}))
+        folders, changed = map(clean, self.notes.get("config_dirs", ())), self.notes.get("changed")
+        return repeating(self.overrides, folders, {clean(k): v for k, v in (changed or {}).items()})
 
 
 def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
@@ -135,7 +121,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     for run in candidates:
         with _noted(run.directory, skipped):
             run.check()
-            run.takes_part = unfinished
+            run.is_finished = run.is_finished or unfinished
             runs.append(run)
     if not runs:
         reasons = "".join(f"\n  {clean(path)}: {reason}" for path, reason in skipped.items())

@@ -194,10 +194,7 @@ def _comparable(experiments: Sequence[Experiment], environments: Sequence[str]) 
     known = [
         replace(e, runs=e.finished, settings={})
         for e in experiments
-        if e.benchmark in environments
-        and e.base in ALGORITHMS
-        and e.is_published_problem
-        and e.finished
+        if e.is_of_paper and e.benchmark in environments
     ]
     cells = Counter(s for _, _, s in {(e.benchmark, e.base, e.planned_steps) for e in known})
     steps = max(cells, key=lambda steps: (cells[steps], steps), default=0)

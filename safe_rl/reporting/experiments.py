@@ -89,6 +89,12 @@ class Experiment:
         return has_limit and self.is_plain
 
     @property
+    def is_of_paper(self) -> bool:
+        """Whether it has finished runs of one of the paper's algorithms on a published problem."""
+        is_known = self.base in ALGORITHMS and self.benchmark in REFERENCE
+        return is_known and self.is_published_problem and bool(self.finished)
+
+    @property
     def finished(self) -> tuple[Run, ...]:
         """Its finished runs."""
         return tuple(run for run in self.runs if run.is_finished)
@@ -212,7 +218,7 @@ def _is_given(key: str, run: Run) -> bool:
 
     In a run with YAML files of the user's, any key may have been set there.
     """
-    if run.notes.get("config_dirs") or key in run.changed:
+    if run.notes.get("config_dirs") or key in run.notes.get("changed", ()):
         return True
     keys = {override.lstrip("+~").partition("=")[0] for override in run.overrides or ()}
     return key.partition(".")[0] in _ALWAYS_NAMED or any(

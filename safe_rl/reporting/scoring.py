@@ -223,14 +223,7 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
     many steps if both keep the constraint and it has no lower return and no higher cost rate, and
     one of them is better.
     """
-    ours = [
-        e
-        for e in experiments
-        if e.base in benchmark.ALGORITHMS
-        and e.is_published_problem
-        and e.benchmark in benchmark.REFERENCE
-        and e.finished
-    ]
+    ours = [e for e in experiments if e.is_of_paper]
     records: list[dict[str, Any]] = []
     for slate in ("SG18", "SG12", "SG6", "SG1", "SG2", "SGPoint", "SGCar", "SGDoggo"):
         names, rows = benchmark.SLATES[slate], []
@@ -241,7 +234,7 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
                 rows.append((record, (there, record["fewest_steps"], record["most_steps"])))
         for record, trained in rows:
             peers = [other for other, as_other in rows if as_other == trained and _keeps(other)]
-            better = [p["algorithm"] for p in peers if _keeps(record) and _dominates(p, record)]
+            better = [p["algorithm"] for p in peers if _keeps(record) and _is_better(p, record)]
             counts = {"all": len(names), "environments": len(trained[0])}
             records.append({**record, **counts, "dominated": ", ".join(better)})
     columns = {
@@ -258,7 +251,7 @@ def paper_table(experiments: Sequence[Experiment]) -> Table:
     return Table("paper", "The paper's Tables 1 and 2", columns, records, note)
 
 
-def _dominates(one: Record, other: Record) -> bool:
+def _is_better(one: Record, other: Record) -> bool:
     """Whether no score of one is worse than the other's, and one of them is better."""
-    ours, theirs = ((r["episode_return"], -r["cost_rate"]) for r in (one, other))
-    return ours != theirs and all(a >= b for a, b in zip(ours, theirs, strict=True))
+    gains = (one["episode_return"] - other["episode_return"], other["cost_rate"] - one["cost_rate"])
+    return min(gains) >= 0 < max(gains)

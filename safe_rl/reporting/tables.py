@@ -180,12 +180,11 @@ def mark_best(
     """
 
     def mark(record: Record) -> str:
-        peers = rivals[record["algorithm"]]
-        group = [other for other in records if rivals[other["algorithm"]] == peers]
+        group = [r for r in records if rivals[r["algorithm"]] == rivals[record["algorithm"]]]
         known = [r[name] for r in group if is_able(r) and not _is_missing(r.get(name))]
-        if len(group) < 2 or not is_able(record) or not known:
-            return ""
-        return "best" if math.isclose(record.get(name, math.nan), best(known)) else ""
+        is_ranked = len(group) > 1 and is_able(record) and bool(known)
+        value = record.get(name, math.nan)
+        return "best" if is_ranked and math.isclose(value, best(known)) else ""
 
     return mark
 

@@ -263,7 +263,7 @@ class Run:
         """Environment steps so far."""
         return int(self.table["steps"][-1])
 
-    @property
+    @cached_property
     def is_finished(self) -> bool:
         """Whether it has its configured number of steps."""
         return self.steps >= self.settings["frames"]

@@ -94,8 +94,8 @@ def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):
     keep(runs, kept)
     assert str(tmp_path) not in gzip.decompress((kept / RUNS).read_bytes()).decode()
     archived = read_archive(kept)
-    assert archived["PointGoal1/ppo/seed0"].changed.keys() == {"frames"}
-    assert not archived["PointGoal1/ppo/seed1"].changed
+    assert archived["PointGoal1/ppo/seed0"].notes["changed"].keys() == {"frames"}
+    assert "changed" not in archived["PointGoal1/ppo/seed1"].notes
     (kept_evaluation,) = archived["PointGoal1/ppo/seed0"].notes["evaluations"]
     assert kept_evaluation.keys() == evaluation.keys() - {"run", "checkpoint_file"}
     # of what is kept, a copy, whose report has the command and the code
