@@ -15,14 +15,25 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
 from safe_rl.checks import checked
-from safe_rl.collectors.workers import (
-    MakeEnv,
-    Makers,
-    WorkerCollector,
-    check_batch,
-    starting_processes,
-)
+from safe_rl.collectors.workers import MakeEnv, Makers, WorkerCollector, starting_processes
 from safe_rl.extras import import_extra
+
+
+def check_batch(frames_per_batch: int, num_envs: int, steps_at_a_time: int = 1) -> None:
+    """Refuse batches, in steps of all environments, that these cannot share equally.
+
+    Raises:
+        ValueError: If the steps are not a positive multiple of those taken together.
+    """
+    together = num_envs * steps_at_a_time
+    if frames_per_batch < 1 or frames_per_batch % together:
+        below = frames_per_batch // together * together
+        nearest = [str(frames) for frames in (below, below + together) if frames > 0]
+        steps = f" that take {steps_at_a_time} steps at a time" if steps_at_a_time > 1 else ""
+        raise ValueError(
+            f"frames_per_batch={frames_per_batch} cannot be shared equally among {num_envs} "
+            f"environments{steps}: use {' or '.join(nearest)}, or another number of environments."
+        )
 
 
 def make_collector(
@@ -82,6 +93,7 @@ def make_process_collector(  # noqa: D417
         policy: Policy, whose weights are sent to the workers.
         num_collectors: Number of processes W, which divides N.
     """
+    check_batch(frames_per_batch, env.batch_size.numel())
 
     def start(makers: Makers) -> MultiSyncCollector:
         with starting_processes():
@@ -98,7 +110,7 @@ def make_process_collector(  # noqa: D417
                 auto_register_policy_transforms=False,
             )
 
-    return WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
+    return WorkerCollector(start, env, make_env, num_collectors, device)
 
 
 @checked
@@ -122,6 +134,7 @@ def make_ray_collector(  # noqa: D417
         resources: Resources of every actor: ``num_cpus``, ``num_gpus``, ``memory``.
     """
     ray = import_extra("ray", "ray")
+    check_batch(frames_per_batch, env.batch_size.numel())
 
     def start(makers: Makers) -> RayCollector:
         collector = RayCollector(
@@ -137,7 +150,7 @@ def make_ray_collector(  # noqa: D417
         collector.update_policy_weights_()  # TorchRL warns if it has not been called
         return collector
 
-    workers = WorkerCollector(start, env, make_env, num_collectors, frames_per_batch, device)
+    workers = WorkerCollector(start, env, make_env, num_collectors, device)
     # not in start(): the processes of Ray end with the thread that has started them
     if not ray.is_initialized():
         ray.init(**{"log_to_driver": False, **ray_init})

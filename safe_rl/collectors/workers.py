@@ -96,11 +96,10 @@ class WorkerCollector:
         env: The run's environment. Its rows are divided among workers; it is not stepped itself.
         make_env: Function that makes such an environment with fewer rows, in a worker.
         num_collectors: Number of workers W.
-        frames_per_batch: Steps of all rows together in one batch, N·T.
         device: Device of the batches.
 
     Raises:
-        ValueError: If N is not a multiple of W, or ``frames_per_batch`` of N.
+        ValueError: If N is not a multiple of W.
     """
 
     def __init__(
@@ -109,11 +108,9 @@ class WorkerCollector:
         env: EnvBase,
         make_env: MakeEnv,
         num_collectors: int,
-        frames_per_batch: int,
         device: torch.device | str,
     ) -> None:
         self._num_envs = env.batch_size.numel()
-        check_batch(frames_per_batch, self._num_envs)
         if self._num_envs % num_collectors:
             raise ValueError(
                 f"{num_collectors} collectors cannot share {self._num_envs} environments equally: "
@@ -204,23 +201,6 @@ class WorkerCollector:
             workers.shutdown(timeout=timeout)
             for scheme in (workers._weight_sync_schemes or {}).values():
                 scheme.shutdown()
-
-
-def check_batch(frames_per_batch: int, num_envs: int, steps_at_a_time: int = 1) -> None:
-    """Refuse batches, in steps of all environments, that these cannot share equally.
-
-    Raises:
-        ValueError: If the steps are not a positive multiple of those taken together.
-    """
-    together = num_envs * steps_at_a_time
-    if frames_per_batch < 1 or frames_per_batch % together:
-        below = frames_per_batch // together * together
-        nearest = [str(frames) for frames in (below, below + together) if frames > 0]
-        steps = f" that take {steps_at_a_time} steps at a time" if steps_at_a_time > 1 else ""
-        raise ValueError(
-            f"frames_per_batch={frames_per_batch} cannot be shared equally among {num_envs} "
-            f"environments{steps}: use {' or '.join(nearest)}, or another number of environments."
-        )
 
 
 _LOOK = 1.0

@@ -23,7 +23,8 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.algorithm_contract import Algorithm, find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, WorkerCollector, make_collector
-from safe_rl.collectors.workers import MakeEnv, check_batch
+from safe_rl.collectors.building import check_batch
+from safe_rl.collectors.workers import MakeEnv
 from safe_rl.envs import make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import node_of, transforms_of

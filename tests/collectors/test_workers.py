@@ -155,7 +155,7 @@ def test_what_keeps_workers_from_starting_is_told():
     def start(makers):
         raise OSError("no room for another process")
 
-    collector = WorkerCollector(start, PointMass(4, 20), PointMass, 2, 80, "cpu")
+    collector = WorkerCollector(start, PointMass(4, 20), PointMass, 2, "cpu")
     with pytest.raises(OSError, match="no room for another process"):
         next(iter(collector))
     collector.shutdown()
