@@ -271,21 +271,17 @@ def _is_name(value: Any) -> bool:
     return isinstance(value, str) and not value.startswith("/") and ".." not in value.split("/")
 
 
-def select(node: Any, *keys: str) -> Any:
-    """The value at a path of keys in nested mappings, or None."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node
-
-
 def config_dirs(notes: Any) -> list[str]:
     """Folders of ``--config-dir``, and of ``config_dir`` in Python, in Hydra's notes of a run.
 
     They are relative to the folder where the run was started, as the user has typed them.
     """
-    runtime = select(notes, "hydra", "runtime")
-    start, sources = select(runtime, "cwd"), select(runtime, "config_sources") or ()
-    paths = [s["path"] for s in sources if s["provider"].endswith("command-line")]
+    try:
+        runtime = notes["hydra"]["runtime"]
+        sources, start = runtime["config_sources"], runtime.get("cwd")
+    except (TypeError, LookupError, AttributeError):
+        return []  # there are no notes, or not these
+    paths = [s["path"] for s in sources or () if s["provider"].endswith("command-line")]
     return [os.path.relpath(path, start) if start else path for path in paths]
 
 
