@@ -9,21 +9,16 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from shlex import quote
 from threading import RLock
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    MissingConfigException,
-    OverrideParseException,
-)
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
@@ -33,7 +28,6 @@ from safe_rl.cli.folders import name_choices
 from safe_rl.cli.options import first_line, unreadable
 from safe_rl.envs import store_configs
 from safe_rl.envs.families import hint_of_gymnasium
-from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean, nearest
@@ -50,6 +44,25 @@ COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
     *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
 )
+
+
+_MEANINGS = (
+    (
+        r"full_key: evaluation(?:\.\w+)?\s+object_type=General",
+        "evaluation: give both keys at once, evaluation='{{interval: 10000, episodes: 5}}'.",
+    ),
+    (
+        r"(?s)(?:no attribute|Missing).*full_key: (?!hydra)(\w+)\S*\s+object_type=General",
+        "this algorithm has no '{}'.",
+    ),
+    (r"'env\.name' not found", "env: the file of an environment needs a line 'name: …'."),
+    (r"Missing mandatory value: (\S+)", "{0} has to be given: {0}=…"),
+    (
+        r"^'(\w+)/(\S+)' is validated against ConfigStore schema",
+        "{}={}: the package has one of this name. Rename your file.",
+    ),
+)
+"""Errors of Hydra and OmegaConf, and what the user has to do."""
 
 
 def compose_run(
@@ -71,19 +84,14 @@ def compose_run(
     for place in places:
         if not place.is_dir():
             raise ValueError(f"config_dir={place}: there is no such folder.")
-    words = [*_searched(places), *words]
+    searched = {"hydra.searchpath": [f"file://{place}" for place in places]} if places else {}
+    words = [*overrides_of(searched), *words]
     try:
         config = _compose(words, name)
         name_choices(config, config.hydra)
     except COMPOSITION_ERRORS as error:
         raise ValueError(explain(error, [f"--config-name={name}", *words])) from error
     return config
-
-
-def _searched(folders: Iterable[str | Path]) -> list[str]:
-    """The override that does what ``--config-dir`` does for a command, if there are folders."""
-    paths = [f"file://{Path(folder).absolute()}" for folder in folders]
-    return [*overrides_of({"hydra.searchpath": paths} if paths else {})]
 
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
@@ -128,129 +136,83 @@ def _written(value: Any) -> str:
 
 def explain(error: Exception, words: Sequence[str]) -> str:
     """What is wrong with a command, in one line; an AttributeError of another cause is raised."""
+    text = str(error)
     if isinstance(error, OverrideParseException):
         return unreadable(str(error.override), error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        return _unknown_choice(error)
-    if str(error).startswith("Config group override must be"):
-        return _unnamed_choice(words) or str(error)
-    if str(error).startswith("Ambiguous value for argument 'env="):
-        return "env=A,B and slate=… are several environments: add -m."
+        group, _, name = str(error.missing_cfg_file).rpartition("/")
+        file = re.match(r"In '(?!config)([^']+)'", text)
+        return _unknown_choice(group, name, error.options, file and f"{file[1]}.yaml")
+    if text.startswith("Config group override must be"):  # Hydra does not say which
+        values = (re.fullmatch(r"(\w+)=(null|true|false|[\d.]+)", word) for word in words)
+        if wrong := next((value for value in values if value and _choices(value[1])), None):
+            return _unknown_choice(*wrong.groups())
+    for pattern, meaning in _MEANINGS:
+        if found := re.search(pattern, f"{text}\n{error.__cause__}"):
+            return meaning.format(*found.groups())
     if type(error) is AttributeError:
-        missing = re.search(r"full_key: (\w+)\.\S+\s+object_type=General", str(error))
-        if missing is None:
-            raise error
-        return _absent(missing[1])
-    unknown = re.match(r"Could not override '([^']+)'\.", str(error))
-    if isinstance(error, ConfigCompositionException) and unknown:
-        is_group = "No match in the defaults list" in str(error)
-        is_new = f"--config-name={RESUMED}" not in words
-        if is_group and is_new and unknown[1] not in General.__annotations__:
-            return f"{unknown[1]}: nothing is chosen that it could replace; add it, +{unknown[1]}=…"
-        inner = re.search(r"full_key: (\S+)", str(error.__cause__))
-        return _unknown_key(inner[1] if inner else unknown[1], unknown[1], words)
-    foreign = re.search(r"(?s)In '(\S+)': .*Key '\S+' not in '(\S+)'\s+full_key: (\S+)", str(error))
-    if foreign:
-        return _foreign_key(*foreign.groups())
-    if "Interpolation key 'env.name' not found" in str(error):
-        return "env: the file of an environment needs a line 'name: …'."
-    taken = re.match(r"'(\w+)/(\S+)' is validated against ConfigStore schema", str(error))
-    if taken:
-        return f"{taken[1]}={taken[2]}: the package has one of this name. Rename your file."
-    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else None
-    absent = re.search(r"Missing mandatory value: (\S+)", str(cause or error))
-    if absent and absent[1] in General.__annotations__:
-        return _absent(absent[1])
-    if cause is not None and str(error) != str(cause):
-        return f"{first_line(error)}: {first_line(cause)}"
-    if absent:
-        return f"{absent[1]} has to be given: {absent[1]}=…"
-    return " ".join(str(error).split())
+        raise error
+    cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    if unknown := re.match(r"Could not override '([^']+)'\.", text):
+        if "No match in the defaults list" not in text:
+            return _unknown_key(cause, words)
+        if f"--config-name={RESUMED}" in words:
+            return f"{unknown[1]}: a continued run keeps its {unknown[1]}."
+        if unknown[1] in General.__annotations__:
+            return f"this algorithm has no '{unknown[1]}'."
+        return f"{unknown[1]}: nothing is chosen that it could replace; add it, +{unknown[1]}=…"
+    return " ".join(text.split()) if cause is error else f"{first_line(error)}: {first_line(cause)}"
 
 
-def _unknown_choice(error: MissingConfigException) -> str:
+def _choices(group: str) -> list[str]:
+    """Names of the package's files in a group of Hydra, and of those in its ConfigStore."""
+    files = [*(CONF / group).glob("*.yaml"), *ConfigStore.instance().repo.get(group, ())]
+    return sorted({Path(file).stem for file in files})
+
+
+def _unknown_choice(
+    group: str, name: str, options: Sequence[str] | None = None, file: str | None = None
+) -> str:
     """A message about a file that does not exist, such as ``env=PointGaol1``."""
-    group, _, name = str(error.missing_cfg_file).rpartition("/")
-    known = list(error.options or ())
-    if not known:
-        known = sorted(file.stem for file in (CONF / group).glob("*.yaml"))
-    file = re.match(r"In '(?!config)([^']+)'", str(error))
-    place = f"{file[1]}.yaml: " if file else ""
+    known, place = options or _choices(group), f"{file}: " if file else ""
     if file and not known:
         return f"{place}there is no {group}. In 'defaults' write /{Path(group).name}: {name}."
     if name in known:
         return f"{place}there is no '{name}': --config-path replaces conf/, --config-dir adds."
-    all_of_them = f"There are {', '.join(known)}"
-    listed = all_of_them if len(known) <= _MOST_LISTED else f"'{PROGRAM} --help' names all"
+    listed = f"There are {', '.join(known)}"
+    if len(known) > _MOST_LISTED:
+        listed = f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
     hint = hint or did_you_mean("none" if name == "null" else name, known, 0.6)
     more = f" {listed}; a file of yours needs --config-dir FOLDER, a module import=FILE.py."
     return f"{place}there is no {group} '{name}'.{hint or more}"
 
 
-def _unnamed_choice(words: Sequence[str]) -> str | None:
-    """A message about a choice that is no name, such as ``logger=null``."""
-    for key, value in re.findall(r"^(\w+)=(null|true|false|[\d.]+)$", "\n".join(words), re.M):
-        try:
-            _compose([f"{key}='{value}'"])
-        except MissingConfigException as error:  # it knows the names
-            return _unknown_choice(error).rpartition(".yaml: ")[2]
-        except COMPOSITION_ERRORS:  # no choice but a value, such as seed=3
-            continue
-    return None
-
-
-def _absent(section: str) -> str:
-    """A message about a section that the algorithm's file does not have."""
-    if section == "evaluation":
-        return "evaluation: give both keys at once, evaluation='{interval: 10000, episodes: 5}'."
-    return f"this algorithm has no '{section}'."
-
-
-def _unknown_key(key: str, given: str, words: Sequence[str]) -> str:
-    """A message about a key that the configuration does not have."""
-    name = RESUMED if f"--config-name={RESUMED}" in words else "config"
-    if name == RESUMED and (key == "env" or (CONF / key).is_dir()):
-        return f"{key}: a continued run keeps its {key}."
-    if key.startswith("cost_limits."):
-        if any(word.startswith("cost_limits=") for word in words):
-            return f"{key}: a file has other limits. To add this one to them: +{key}=…"
+def _unknown_key(error: Any, words: Sequence[str]) -> str:
+    """A message about a key that the configuration, which OmegaConf's error has, does not have."""
+    key, config = str(error.full_key), error.parent_node._get_root()
+    section, known = key.partition(".")[0], keys_of(config)
+    if section == "cost_limits":
         example = f"{{{key.partition('.')[2]}: 10}}"
-        return f"{key}: limits are given together, cost_limits='{example}'."
-    wrong = ("-", f"{given}=", f"{key}=")
-    settings = (word for word in words if "=" in word)
-    others = [word for word in settings if not word.lstrip("+~").startswith(wrong)]
-    folders = [word for flag, word in pairwise(words) if flag in ("--config-dir", "-cd")]
-    folders += [word.partition("=")[2] for word in words if word.startswith("--config-dir=")]
-    try:
-        config = _compose([*_searched(folders), *others], name)
-    except (HydraException, OmegaConfBaseException):
-        is_sweep = {"-m", "--multirun"} & {*words}
-        of_algorithm = is_sweep and not key.startswith("transforms.")
-        hint = f" If only swept algorithms have it, write '++{key}=…'." if of_algorithm else ""
-        return unknown_key(key, []) + hint
-    section = key.partition(".")[0]
-    if OmegaConf.is_missing(config, section):
-        return _absent(section)
-    if section == "env" and "kwargs" in config.env:
-        name = key.removeprefix("env.").removeprefix("kwargs.")
-        if guess := nearest(name, map(str, config.env), 0.7):
-            return f"there is no key '{key}'. Did you mean 'env.{guess}'?"
         return (
-            f"there is no key '{key}'. Arguments of the environment's constructor are given as "
-            f"env.kwargs='{{{name}: …}}'."
+            f"{key}: limits are given together, cost_limits='{example}'. To add this one to those "
+            f"of a file: +{key}=…"
         )
-    own = rf"\+*{section}(\._target_=|=.*\b_target_: ?)(?!['\"]? ?safe_rl\.)"
-    if any(re.match(own, word) for word in words) and not key.endswith("._target_"):
-        return f"there is no key '{key}'. What a class of yours takes is added: '+{key}=…'."
-    return unknown_key(key, keys_of(config))
-
-
-def _foreign_key(file: str, section: str, key: str) -> str:
-    """A message about a key of a chosen file that other choices do not have."""
-    is_of_ours = key.startswith("env.") and key.removeprefix("env.") in KEYS
-    where = " Environments of Safety Gym have it, such as env=PointGoal1." if is_of_ours else ""
-    return f"{'='.join(file.rsplit('/', 1))} sets '{key}', which {section} does not have.{where}"
+    is_swept = any(re.match("algo=.*,", word) for word in words)
+    part = config.get(section)
+    if part == {} and section != "transforms" and not is_swept:  # made to hold this key
+        return f"this algorithm has no '{section}'."
+    hint = f"If only swept algorithms have it, write '++{key}=…'." if is_swept else ""
+    target = str(part.get("_target_")) if OmegaConf.is_dict(part) else "None"
+    if section == "env" and "kwargs" in part:
+        name = key.removeprefix("env.").removeprefix("kwargs.")
+        known = [f"env.{other}" for other in part if nearest(name, [str(other)], 0.7)]
+        arguments = f"Arguments of its constructor are given as env.kwargs='{{{name}: …}}'."
+        hint = "" if known else arguments
+    elif key.endswith("._target_") or not target.startswith(("safe_rl.", "None")):
+        known = [] if key.endswith("._target_") else known
+        hint = f"What a class of yours takes is added: '+{key}=…'."
+    return unknown_key(key, known, hint)
 
 
 def read_resumed(
@@ -263,7 +225,16 @@ def read_resumed(
     Raises:
         ValueError: If the run cannot be continued, or a word does not go with ``resume=``.
     """
-    config = _read(directory)
+    run = Run(directory)
+    try:
+        config = dict(run.settings)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"resume={directory}: {error}") from None
+    if run.checkpoints_folder.exists() and not run.has_begun:
+        raise ValueError(
+            f"resume={directory}: it has no progress.csv: an exported policy cannot be trained on; "
+            "restore a run's"
+        )
     check_imports(config, modules, directory)
     for word in words:
         key = word.lstrip("+~").partition("=")[0]
@@ -283,26 +254,11 @@ def read_resumed(
         config.pop("logger", None)  # keys of another logger would stay
     place = str(directory).replace("${", "\\${")
     return {
+        **config,
+        # last: what a file has for Hydra could run code
         "defaults": ["_self_", {"logger": None}, {"override hydra/job_logging": "stdout"}],
         "hydra": {"run": {"dir": place}, "output_subdir": None},
-        **config,
     }
-
-
-def _read(directory: Path) -> dict[str, Any]:
-    run = Run(directory)
-    try:
-        config = dict(run.settings)
-        if run.checkpoints_folder.exists() and not run.has_begun:
-            raise ValueError(
-                "it has no progress.csv: an exported policy cannot be trained on; restore a run's"
-            )
-        for key in ("hydra", "defaults"):
-            if key in config:
-                raise ValueError(f"{run.config_file.name} has the key '{key}', which no run writes")
-        return config
-    except (OSError, ValueError) as error:
-        raise ValueError(f"resume={directory}: {error}") from None
 
 
 def _refuse_foreign_cluster(

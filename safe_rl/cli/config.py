@@ -310,7 +310,7 @@ def keys_of(config: DictConfig) -> list[str]:
     return [key for key in flatten(plain) if not key.startswith("hydra.")]
 
 
-def unknown_key(key: str, known: Iterable[str]) -> str:
+def unknown_key(key: str, known: Iterable[str], hint: str = "") -> str:
     """A message that a key does not exist; it names keys with the same end, or the nearest one.
 
     Examples:
@@ -319,14 +319,9 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
         >>> unknown_key("env.hazard_num", ["env.hazards_num", "env.vases_num"])
         "there is no key 'env.hazard_num'. Did you mean 'env.hazards_num'?"
     """
-    if key.endswith("._target_"):
-        return f"there is no key '{key}': write '+{key}=…' to add it."
     known = [path for path in known if path != key]
     same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
-    meant = same or filter(None, [nearest(key, known, 0.7)])
-    names = " or ".join(f"'{path}'" for path in meant)
-    if names:
-        return f"there is no key '{key}'. Did you mean {names}?"
-    return (
-        f"with this algorithm and environment there is no key '{key}'. '--cfg job' prints all keys."
-    )
+    names = " or ".join(f"'{path}'" for path in same or filter(None, [nearest(key, known, 0.7)]))
+    meant = f" Did you mean {names}?" if names else ""
+    hint = hint if hint or meant else "'--cfg job' prints all of this algorithm and environment."
+    return f"there is no key '{key}'.{meant}{hint and f' {hint}'}"

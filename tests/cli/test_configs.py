@@ -143,7 +143,7 @@ def test_limits_of_a_file_take_the_place_of_the_default(tmp_path):
     ):
         (config,) = composed(*words, *more)
         assert config.cost_limits == limits
-    message = "cost_limits.cost_vases: a file has other limits. To add this one to them: +cost_"
+    message = "To add this one to those of a file: +cost_limits.cost_vases=…"
     assert message in status_of(*words, "+experiment=mine", "cost_limits={cost_vases: 3}")
     message = "experiment: nothing is chosen that it could replace; add it, +experiment=…"
     assert status_of(*words, "experiment=mine") == message
