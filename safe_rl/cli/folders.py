@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from hashlib import sha256
 from pathlib import Path
@@ -11,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.envs.families import env_names
 from safe_rl.files import CONF
+from safe_rl.runs.identity import Role, role_of
 
 
 def env_name(name: str, chosen: str, sources: Iterable[Any] = ()) -> str:
@@ -29,14 +31,22 @@ def env_name(name: str, chosen: str, sources: Iterable[Any] = ()) -> str:
     return chosen if is_of_another else name
 
 
-def short_name(name: str) -> str:
-    """The name of one folder: without slashes, and of one over 255 bytes its beginning and a hash.
+def job_name(words: Iterable[str]) -> str:
+    """The name of one folder for the overrides of a job in a sweep.
+
+    It lacks those that are in the folder's path or belong to the machine, and has no slashes; of
+    one over 255 bytes it is the beginning and a hash.
 
     Examples:
-        >>> short_name("init_from=../a"), short_name("a" * 300) == "a" * 200 + "-9835fa6b"
-        ('init_from=.._a', True)
+        >>> job_name(["seed=3", "init_from=../a", "device=cuda", "frames=3e5"])
+        'frames=3e5,init_from=.._a'
+        >>> job_name(["note=" + "a" * 300]) == "note=" + "a" * 195 + "-4c775031"
+        True
     """
-    name = name.replace("/", "_")
+    keys = {word: word.lstrip("+~").partition("=")[0] for word in words}
+    in_path = ("env", "algo", "seed")
+    named = [w for w, k in keys.items() if k not in in_path and role_of(k) is not Role.MACHINE]
+    name = ",".join(sorted(named)).replace("/", "_")
     if len(name.encode()) <= 255:
         return name
     beginning = name.encode()[:200].decode(errors="ignore")
@@ -50,15 +60,13 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
         ValueError: If a transform is chosen twice, or a changed environment has the name of another
             one of the package.
     """
-    choices = hydra.runtime.choices
-    chosen_names = [*choices.items()]
+    choices, transforms = hydra.runtime.choices, config.get("transforms") or ()
     for word in hydra.overrides.task:
-        names = [n.strip() for n in str(word).partition("=[")[2].rstrip("]").split(",")]
-        if word.startswith("transforms=["):
-            chosen_names += [("transforms", name) for name in names]
-            if len(set(names)) < len(names):
-                raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
-    _refuse_hidden_files(chosen_names, hydra.runtime.config_sources)
+        names = re.findall(r"[^][,\s]+", word.removeprefix("transforms="))
+        if word.startswith("transforms=[") and len(set(names)) < len(names):
+            raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
+    chosen_files = [*choices.items(), *(("transforms", name) for name in transforms)]
+    _refuse_hidden_files(chosen_files, hydra.runtime.config_sources)
     if "algo" in choices:
         config.algo.name = choices["algo"].rpartition("/")[2]
     name, chosen = config.env.name, choices.get("env")
@@ -87,4 +95,4 @@ def _refuse_hidden_files(choices: Iterable[tuple[str, Any]], sources: Iterable[A
 
 
 OmegaConf.register_new_resolver("safe_rl.env_name", env_name, replace=True)
-OmegaConf.register_new_resolver("safe_rl.short_name", short_name, replace=True)
+OmegaConf.register_new_resolver("safe_rl.job_name", job_name, replace=True)
