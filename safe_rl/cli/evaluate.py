@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from safe_rl.cli.options import OptionError, run_command
+from safe_rl.checks import SettingError
+from safe_rl.cli.options import run_command
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
@@ -38,7 +39,7 @@ def _certify(directory: Path, options: EvaluationOptions) -> int:
     read = {name: getattr(options, name) for name in names}
     for name, value in vars(EvaluationOptions(**read)).items():
         if getattr(options, name) != value:
-            raise OptionError(
+            raise SettingError(
                 f"{name}: it is ignored by certify=true. A certificate is about the run's own "
                 "environment. Its options are certificate.episodes=… and so on, "
                 "deterministic=true and num_threads=…"

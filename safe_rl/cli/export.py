@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from safe_rl.checks import CheckedOptions, option
-from safe_rl.cli.options import OptionError, run_command
+from safe_rl.checks import CheckedOptions, SettingError, option
+from safe_rl.cli.options import run_command
 from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
     has_certified = run.newest_checkpoint("certified") is not None
     which = options.checkpoint or ("certified" if has_certified else "last")
     if target.suffix not in ("", ".onnx"):
-        raise OptionError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
+        raise SettingError(f"{target}: give a file FILE.onnx, or a FOLDER without a suffix.")
     if target.suffix == ".onnx":
         check_imports(run.config, modules, run.directory)
         checkpoint = run.find_checkpoint(which)
@@ -56,7 +56,10 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         with closing(run.make_env()) as env:
             export_onnx(run, env, checkpoint, target, sampled=sampled)
         # the file's actions have the environment's own units already
-        others = {n: t for n, t in transforms_of(run.config).items() if not _is_scaling(t)}
+        nodes = transforms_of(run.config).items()
+        others = (
+            n for n, node in nodes if not str(node.get("_target_")).endswith(".ActionScaling")
+        )
         if names := ", ".join(others):
             print(
                 f"The file has the policy without the transforms {names}: your program has to do "
@@ -66,10 +69,6 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         pack_policy(run.directory, target, which)
     print(f"wrote {target}")
     return 0
-
-
-def _is_scaling(transform: Mapping[str, Any]) -> bool:
-    return str(transform.get("_target_")).endswith(".ActionScaling")
 
 
 def _choose_actions(run: Run, checkpoint: Path, asked: str | None) -> bool:

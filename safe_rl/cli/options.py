@@ -34,6 +34,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from safe_rl.checks import SettingError
 from safe_rl.files import printable
 from safe_rl.naming import did_you_mean
 
@@ -45,16 +46,12 @@ _FORMAT = warnings.formatwarning
 _EXPECTED = (ValueError, OSError, RuntimeError, ImportError, MemoryError, OmegaConfBaseException)
 
 
-class OptionError(ValueError):
-    """Words of a command that cannot be used; the message says what to write instead."""
-
-
 def read_options(words: Iterable[str], schema: type[Options]) -> Options:
     """Read options from words ``key=value``; nested keys have dots.
 
     Raises:
-        OptionError: If a word is no option of the dataclass.
-        SettingError: If an option has a value that its annotation does not allow.
+        SettingError: If a word is no option of the dataclass, or has a value that its annotation
+            does not allow.
 
     Examples:
         >>> from safe_rl.evaluation import EvaluationOptions
@@ -66,13 +63,13 @@ def read_options(words: Iterable[str], schema: type[Options]) -> Options:
     for word in words:
         key, equals, text = word.partition("=")
         if not equals:
-            raise OptionError(f"'{word}' is not an option: they are written key=value.")
+            raise SettingError(f"'{word}' is not an option: they are written key=value.")
         # texts are taken literally: the grammar would change `off` and `007`, and refuse `it's`
         is_text = _is_text(kinds.get(key)) and text[:1] not in ("'", '"') and text != "null"
         try:
             given[key] = text if is_text else OverridesParser.create().parse_override(word).value()
         except HydraException as error:
-            raise OptionError(unreadable(word, error)) from None
+            raise SettingError(unreadable(word, error)) from None
     return make_options(given, schema)
 
 
@@ -83,7 +80,7 @@ def make_options(given: Mapping[str, Any], schema: type[Options]) -> Options:
     for key, value in given.items():
         name = key.partition(".")[0]
         if name not in kinds:
-            raise OptionError(
+            raise SettingError(
                 f"Unknown option '{name}'.{did_you_mean(name, kinds)} "
                 f"Options are: {', '.join(kinds)}."
             )

@@ -76,22 +76,23 @@ def keep_robot(run: Run, env: Mapping[str, Any]) -> None:
     replace_json(run.robot_file, note)
 
 
-def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an environment's node with the robot that a run began with.
+def robot_of(run: Run, env: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
+    """Return an environment's node, resolved, with the robot that a run began with.
 
     A node that names another robot, or a run that has not begun, changes nothing.
 
     Raises:
         ConfigError: If the file of the robot is gone, or has changed.
     """
+    node: Any = OmegaConf.to_container(env, resolve=True) if OmegaConf.is_config(env) else {**env}
     if not run.robot_file.is_file():
-        return dict(env)
+        return node
     note = read_json(run.robot_file)
     if not (isinstance(note, dict) and {"robot_base", "sha256", "file"} <= note.keys()):
         raise ConfigError(f"{run.robot_file} is not as a run writes it.")
-    if note["robot_base"] != env.get("robot_base"):
-        return dict(env)
-    original, content = own_robot(env), note["sha256"]
+    if note["robot_base"] != node.get("robot_base"):
+        return node
+    original, content = own_robot(node), note["sha256"]
     path = run.robot_folder / str(note["file"]) if note["file"] else original
     if path is None or not path.is_file():
         raise ConfigError(f"'robot_base': there is no file {path}, with which the run began.")
@@ -100,12 +101,7 @@ def robot_of(run: Run, env: Mapping[str, Any]) -> dict[str, Any]:
     home = run.robot_folder if note["file"] else Path(path.anchor or ".")
     if not is_robot(path, home, content):
         raise ConfigError(f"'robot_base': {path} has changed since the run began.")
-    return {**env, "robot_base": str(path)}
-
-
-def node_of(run: Run, config: DictConfig) -> dict[str, Any]:
-    """The environment's node of a run that begins or continues; see `robot_of`."""
-    return robot_of(run, OmegaConf.to_container(config.env, resolve=True))  # type: ignore[arg-type]
+    return {**node, "robot_base": str(path)}
 
 
 def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:

@@ -27,7 +27,7 @@ from safe_rl.collectors.building import check_batch
 from safe_rl.collectors.workers import MakeEnv
 from safe_rl.envs import make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
-from safe_rl.evaluation.loading import node_of, transforms_of
+from safe_rl.evaluation.loading import robot_of, transforms_of
 from safe_rl.runs.checkpoints import CheckpointStore, check_interface, read_facts
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
@@ -48,7 +48,7 @@ def seed_everything(seed: int, num_threads: int | None) -> None:
 
 def build_run(config: DictConfig, run: Run) -> Trainer:
     """Build all parts of a run, with its environments and periodic evaluations."""
-    node, num_collectors = node_of(run, config), config.collector.num_collectors
+    node, num_collectors = robot_of(run, config.env), config.collector.num_collectors
     num_threads = config.num_threads or 0  # of physics; 0: one per core
     if num_collectors > 1:
         num_threads = max(1, (num_threads or os.cpu_count() or 1) // num_collectors)

@@ -26,7 +26,7 @@ from safe_rl.collectors import EpisodeError, WorkerError
 from safe_rl.envs import ConfigError, ContractError, complete_env, make_env
 from safe_rl.evaluation.certificate import has_options
 from safe_rl.evaluation.certifying import certify_run
-from safe_rl.evaluation.loading import keep_robot, node_of
+from safe_rl.evaluation.loading import keep_robot, robot_of
 from safe_rl.evaluation.settings import certificate_options, has_tested_measure
 from safe_rl.files import PROGRAM, replacing
 from safe_rl.runs.checkpoints import is_finished
@@ -91,7 +91,7 @@ def train(
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
             print(f"{done}. To train on: {again(2 * max(run.steps, config.frames))}")
-            with closing(make_env(node_of(run, config), num_envs=1)) as env:
+            with closing(make_env(robot_of(run, config.env), num_envs=1)) as env:
                 stopped_by, length = None, env.max_episode_steps
         else:
             if not continues:
@@ -137,7 +137,7 @@ def complete(config: DictConfig, run: Run) -> None:
     # keys that are null take the value that is found
     known = {key: value for key, value in given.items() if value is not None}
     with open_dict(config):
-        config.env = complete_env(node_of(run, config)) | known
+        config.env = complete_env(robot_of(run, config.env)) | known
 
 
 def _command_again(

@@ -11,7 +11,6 @@ import pytest
 
 from safe_rl.checks import SettingError
 from safe_rl.cli.options import (
-    OptionError,
     keep_streams,
     make_options,
     read_options,
@@ -67,7 +66,7 @@ def test_names_stay_as_they_are_written(name):
     ],
 )
 def test_errors_say_what_to_write(argument, message):
-    with pytest.raises((OptionError, SettingError), match=message):
+    with pytest.raises(SettingError, match=message):
         read_options([argument], EvaluationOptions)
 
 
