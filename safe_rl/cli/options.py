@@ -85,9 +85,8 @@ def make_options(given: Mapping[str, Any], schema: type[Options]) -> Options:
                 f"Options are: {', '.join(kinds)}."
             )
         OmegaConf.update(read, key, _plain(value), force_add=True)
-    settings = OmegaConf.to_container(read)
-    assert isinstance(settings, dict)
-    return schema(**{str(key): value for key, value in settings.items()})
+    settings: Any = OmegaConf.to_container(read)
+    return schema(**settings)
 
 
 def _is_text(kind: Any) -> bool:
