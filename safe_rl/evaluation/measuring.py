@@ -188,7 +188,7 @@ def evaluate(
     changed.env = override_env(config, options.env)
     evaluation = PolicyEvaluation(changed, checkpoint, options, make_env or maker_of(directory))
     # some environments draw pictures only if this key asks for it
-    drawing = {"render_mode": "rgb_array"} if "render_mode" in evaluation.node else {}
+    drawing: Any = {"render_mode": "rgb_array"} if "render_mode" in evaluation.node else {}
     summary, table = (run.evaluation_file(options.name, kind) for kind in ("json", "csv"))
     films = [run.evaluation_file(options.name, "mp4")] if options.video else []
     films += [Path(options.picture)] if options.picture else []
