@@ -6,11 +6,16 @@ import safe_rl  # noqa: F401, has to come before torch
 
 # isort: split
 import torch
+from hydra.core.config_store import ConfigStore
 from hypothesis import settings
 
 # the same examples in each run, and no deadlines: these depend on the machine
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
+
+# composing a configuration copies Hydra's store, with every environment, before anything is read:
+# nearly half of its time; what is taken out of the store is a copy anyway
+ConfigStore.__deepcopy__ = lambda store, memo: store
 
 # as many processes as cores run tests: a second thread in each would only be in the way
 torch.set_num_threads(1)
