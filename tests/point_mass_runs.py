@@ -21,7 +21,7 @@ def trainer_of(
 
 
 def point_mass_trainer(
-    directory: Path, *overrides: str, num_steps: int = 20, minibatch_size: int | None = 40
+    directory: Path, *overrides: str, num_steps: int = 20, minibatch_size: int | None = 80
 ) -> Trainer:
     """That of `point_mass_config`, with episodes of so many steps."""
     config = point_mass_config(*overrides, minibatch_size=minibatch_size)

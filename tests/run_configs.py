@@ -38,12 +38,12 @@ def compose_config(*overrides: str) -> DictConfig:
     return config
 
 
-def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictConfig:
+def point_mass_config(*overrides: str, minibatch_size: int | None = 80) -> DictConfig:
     """A run on the point mass that takes a second: 8 epochs of 4 x 40 steps.
 
     ``minibatch_size=None`` leaves a policy update alone that knows no minibatches.
     """
-    minibatches = [f"policy_update.minibatch_size={minibatch_size}", "policy_update.num_passes=3"]
+    minibatches = [f"policy_update.minibatch_size={minibatch_size}", "policy_update.num_passes=2"]
     return compose_config(
         "env=PointMass",
         "frames=1280",
@@ -51,8 +51,8 @@ def point_mass_config(*overrides: str, minibatch_size: int | None = 40) -> DictC
         "frames_per_batch=160",
         "model.hidden_sizes=[16]",
         *(minibatches if minibatch_size else []),
-        "critic_update.minibatch_size=40",
-        "critic_update.num_passes=3",
+        "critic_update.minibatch_size=80",
+        "critic_update.num_passes=2",
         "logger=none",
         *overrides,
     )
