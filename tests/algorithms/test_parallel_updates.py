@@ -29,6 +29,16 @@ def two_threads():
         yield
 
 
+@pytest.fixture
+def calls(monkeypatch):
+    """What would be done at the same time, done one after the other."""
+    noted = []
+    monkeypatch.setattr(
+        on_policy, "in_parallel", lambda *both: noted.append(both) or [call() for call in both]
+    )
+    return noted
+
+
 def test_both_are_under_way_at_once(two_threads):
     meeting = threading.Barrier(2, timeout=10)  # breaks unless both come
     assert in_parallel(meeting.wait, meeting.wait) in {(0, 1), (1, 0)}
@@ -84,11 +94,7 @@ def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
 @pytest.mark.parametrize(
     ("loss", "number"), [("safe_rl.objectives.PPOLoss", 1), (f"{__name__}.WithCritic", 0)]
 )
-def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_path, monkeypatch):
-    calls = []
-    monkeypatch.setattr(
-        on_policy, "in_parallel", lambda *both: calls.append(both) or [call() for call in both]
-    )
+def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_path, calls):
     trainer = point_mass_trainer(tmp_path, "algo=ppo", f"loss._target_={loss}")
     row = trainer.epoch(iter(trainer.collector))
     assert len(calls) == number
@@ -96,12 +102,8 @@ def test_a_loss_that_moves_the_critic_comes_before_its_fit(loss, number, tmp_pat
     assert row["critic_num_steps"] == 4
 
 
-def test_an_actor_that_shares_layers_with_the_critic_is_moved_before_its_fit(tmp_path, monkeypatch):
+def test_an_actor_that_shares_layers_with_the_critic_is_moved_before_its_fit(tmp_path, calls):
     """Also by a step on a plain function, which has no parameters of its own."""
-    calls = []
-    monkeypatch.setattr(
-        on_policy, "in_parallel", lambda *both: calls.append(both) or [call() for call in both]
-    )
     trainer = point_mass_trainer(tmp_path, "algo=trpo", minibatch_size=None)
     algorithm = trainer.algorithm
     loss = algorithm.policy_update.loss

@@ -7,7 +7,7 @@ import torch
 from gymnasium_envs import Walk
 from point_mass import PointMass
 from run_configs import off_policy_config
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Unbounded
 
 from safe_rl.algorithms import OffPolicy
 from safe_rl.envs import from_gymnasium
@@ -33,23 +33,6 @@ class Acting(PointMass):
 def test_other_actions_than_vectors_within_bounds_are_refused(spec, message):
     with pytest.raises(ValueError, match=message):
         OffPolicy.from_config(off_policy_config("algo=sac"), Acting(spec))
-
-
-@pytest.mark.parametrize(
-    ("observation", "message"),
-    [
-        (
-            Composite(b=Unbounded((2, 3)), a=Unbounded((2, 4)), shape=[2]),
-            r"a \[4\], b \[3\], but model=mlp.*use model=dict",
-        ),
-        (Unbounded((2, 9, 9, 3), dtype=torch.uint8), r"\[9, 9, 3\], .*model=cnn for the pictures"),
-    ],
-)
-def test_other_observations_than_a_vector_are_refused(observation, message):
-    env = PointMass(2)
-    env.observation_spec = Composite(observation=observation, shape=[2])
-    with pytest.raises(ValueError, match=message):
-        OffPolicy.from_config(off_policy_config("algo=sac"), env)
 
 
 class Seen(Walk):

@@ -82,9 +82,7 @@ def test_a_changed_configuration_is_made_and_stored(name):
         make_env(["PointGoal1"])
 
 
-def test_names_of_families_and_of_2019_are_known():
-    assert make_env("SafeSwimmerVelocity").config.robot == "swimmer"
-    assert make_env("Safexp-CarGoal1-v0").config.robot_base == "car"
+def test_names_that_are_taken_or_unknown_are_refused():
     with pytest.raises(ConfigError, match="'PointGoal1' is a built-in environment"):
         store_config("PointGoal1", {"hazards_num": 3})  # make_env would make the built-in one
     with pytest.raises(ConfigError, match="seed=-1: it must be greater than or equal to 0"):

@@ -139,15 +139,6 @@ def test_the_size_of_rewards_is_the_deviation_of_all_so_far():
     assert loss.reward_unit == 1
 
 
-def test_a_loss_that_knows_no_scales_says_so():
-    loss = SACLagrangianLoss(
-        make_squashed_actor(3, *BOUNDS, hidden_sizes=[8]), make_q(), make_q(num_outputs=2),
-        multiplier=lagrange(1.0, 1.0), cost_keys=COSTS, **SAC,
-    )  # fmt: skip
-    with pytest.raises(ValueError, match=r"call prepare\(batch, limits\) with every batch"):
-        loss(make_steps())
-
-
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 @pytest.mark.parametrize("key", [None, "steps_to_next_obs", "span"])
 @pytest.mark.parametrize("is_bounded", [False, True])

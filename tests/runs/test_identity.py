@@ -97,13 +97,15 @@ def test_the_order_of_transforms_does():
     assert first != second
 
 
+def begun_from(run):
+    return experiment_of(as_saved() | {"init_from": f"runs/{run}"})
+
+
 def test_runs_from_the_networks_of_several_seeds_are_one_experiment():
     for pattern in ("small/seed{}", "small/2026-01-3{0}_12-0{0}-00_seed{0}_2", "small_seed{}"):
-        sources = [f"init_from=runs/{pattern.format(seed)}" for seed in (0, 1)]
-        first, second = (experiment_of(as_saved(source)) for source in sources)
-        assert first == second != experiment_of(as_saved("init_from=runs/large/seed0"))
-    one, other = (experiment_of(as_saved(f"init_from=runs/{name}")) for name in ("goal1", "goal2"))
-    assert one != other
+        first, second = (begun_from(pattern.format(seed)) for seed in (0, 1))
+        assert first == second != begun_from("large/seed0")
+    assert begun_from("goal1") != begun_from("goal2")
 
 
 def test_a_sweep_continues_an_archived_run_that_lacks_the_kind_of_physics():
