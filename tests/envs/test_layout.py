@@ -198,7 +198,7 @@ def test_pinned_layouts():
 
 HOPELESS = {
     "placements_margin": (1e9, "'goal' did not fit.*'placements_margin'"),
-    "hazards_num": (60, r"'hazard\d+' did not fit.*'hazards_num' is 60.*'hazards_keepout'"),
+    "hazards_num": (40, r"'hazard\d+' did not fit.*'hazards_num' is 40.*'hazards_keepout'"),
     "walls_num": (1000, "'goal' did not fit.*'walls_num' is 1000"),
     "hazards_locations": ([[0.0, 0.0]] * 8, "'hazard1' did not fit.*'hazards_locations'"),
 }
