@@ -15,16 +15,15 @@ from safe_rl.envs import OpenGLError
 from safe_rl.envs.safety_gym.config import ROBOTS
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv
 
-PLACE = (1.0, 0.5)
-# One object of every kind at PLACE, and the colour that the benchmark gives it.
+# One object of every kind, where it stands, and the colour that the benchmark gives it.
 KINDS = {
-    "box": ({"task": "push", "goal_locations": [(-1, -1)], "box_locations": [PLACE]}, (1, 1, 0)),
-    "button": ({"buttons_num": 1, "buttons_locations": [PLACE]}, (1, 0.5, 0)),
-    "goal": ({"task": "goal", "goal_locations": [PLACE]}, (0, 1, 0)),
-    "vase": ({"vases_num": 1, "vases_locations": [PLACE]}, (0, 1, 1)),
-    "hazard": ({"hazards_num": 1, "hazards_locations": [PLACE]}, (0, 0, 1)),
-    "pillar": ({"pillars_num": 1, "pillars_locations": [PLACE]}, (0.5, 0.5, 1)),
-    "gremlin": ({"gremlins_num": 1, "gremlins_locations": [PLACE]}, (0.5, 0, 1)),
+    "box": ((1.5, 0.0), (1, 1, 0)),
+    "button": ((-0.3, 1.5), (1, 0.5, 0)),
+    "goal": ((1.0, 1.1), (0, 1, 0)),
+    "vase": ((-1.4, 0.6), (0, 1, 1)),
+    "hazard": ((-1.4, -0.6), (0, 0, 1)),
+    "pillar": ((-0.3, -1.5), (0.5, 0.5, 1)),
+    "gremlin": ((1.0, -1.1), (0.5, 0, 1)),
 }
 ON_HAZARD = {
     "hazards_num": 1,
@@ -35,14 +34,21 @@ ON_HAZARD = {
 }
 
 
+@pytest.fixture(scope="module")
+def everything():
+    config = {"task": "push"}
+    for kind, (place, _) in KINDS.items():
+        name = kind if kind in ("box", "goal") else f"{kind}s"
+        config |= {f"{name}_locations": [place]} | ({} if name == kind else {f"{name}_num": 1})
+    return make_env(config)
+
+
 @needs_opengl
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_object_is_seen_where_it_stands_in_its_colour(kind):
-    config, rgb = KINDS[kind]
-    env = make_env(config)
-    floor = colour_at(env, -PLACE[0], PLACE[1])
-    assert np.ptp(floor) < 0.02
-    assert likeness(colour_at(env, *PLACE), rgb) > 0.95
+def test_an_object_is_seen_where_it_stands_in_its_colour(everything, kind):
+    (x, y), rgb = KINDS[kind]
+    assert likeness(colour_at(everything, x, y), rgb) > 0.95
+    assert np.ptp(colour_at(everything, x / 2, y / 2)) < 0.02  # the floor before it
 
 
 # What files of robots often have, too.
@@ -63,14 +69,16 @@ def test_a_robots_own_names_do_not_clash_with_those_of_pictures(tmp_path):
     path = tmp_path / "robot.xml"
     text = ROBOTS["point"].read_text()
     path.write_text(text.replace("<worldbody>", ASSETS).replace('<camera name="vision"', TRACK))
-    config, rgb = KINDS["goal"]
+    (x, y), green = KINDS["goal"]
     observed = {"observe_sensors": False, "observe_goal_lidar": True}
-    env = make_env({**config, **observed, "robot_base": str(path)})
-    assert np.ptp(colour_at(env, -PLACE[0], PLACE[1])) < 0.02
+    env = make_env(
+        {"task": "goal", "goal_locations": [(x, y)], **observed, "robot_base": str(path)}
+    )
+    assert np.ptp(colour_at(env, -x, y)) < 0.02
     seen = env.render(0, camera="track", width=101, height=101)  # straight down, x to the right
     height = 101 / (2 * 3.1 * math.tan(math.radians(45 / 2)))  # pixels per metre
-    line, column = round(50 - PLACE[1] * height), round(50 + PLACE[0] * height)
-    assert likeness(seen[line, column] / 255, rgb) > 0.95
+    line, column = round(50 - y * height), round(50 + x * height)
+    assert likeness(seen[line, column] / 255, green) > 0.95
     with pytest.raises(ValueError, match=r"\['fixednear', 'fixedfar', 'track', 'vision', 'free'\]"):
         env.render(0, camera="eye")
     with pytest.raises(ValueError, match="Did you mean 'fixedfar'"):
