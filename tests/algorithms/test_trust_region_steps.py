@@ -1,4 +1,4 @@
-"""TRPO and CPO: losses against finite differences, steps against their own optimality."""
+"""TRPO and CPO: losses against their definitions, steps against their own optimality."""
 
 import pytest
 import torch

@@ -14,8 +14,6 @@ from torchrl.envs.utils import check_env_specs
 
 from safe_rl.envs import ConfigError, from_gymnasium
 
-NODE = {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", "cost_keys": ["fast"], "num_steps": 9}
-
 
 class Counter(gymnasium.Env):
     """Terminates after as many steps as its seed says; observes what it was and how far it is."""

@@ -26,6 +26,7 @@ def batches(number: int, rate: float, seed: int = 0, unit: float = 1.0) -> list[
 
 
 NO_EPISODES = torch.empty(0)
+NOTHING_ENDED = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
 GAINS = {"init": 0.0, "kp": 1.0, "ki": 0.1, "saturation": 0.5, "highest": 5.0}
 
 
@@ -112,7 +113,6 @@ def test_a_cost_and_a_limit_ten_times_as_large_give_the_same_picture():
 @pytest.mark.parametrize("size", [0.01, 1000.0])
 def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
     """Its λ weighs advantages in units of one cost, and so has to move by violations in them."""
-    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     found = []
     for unit in (1.0, size):
         limits = {"cost": 25.0 * unit}
@@ -124,7 +124,7 @@ def test_plain_dual_ascent_weighs_costs_of_any_size_alike(size):
         loss = RCPOLoss(make_actor(), multiplier, clip_epsilon=0.2, entropy_coeff=0.0)
         for costs in batches(5, 0.05, unit=unit):
             batch = TensorDict({"next": {"cost": costs}}, [20, 100])
-            state = constraints.update(batch, episodes)
+            state = constraints.update(batch, NOTHING_ENDED)
             multiplier.update(state)
         samples = make_batch(loss.actor_network, [50])
         samples["cost_advantage"] *= unit
@@ -138,11 +138,10 @@ def test_a_falling_limit_is_no_growth_of_the_cost():
     gains = {"init": 0.0, "kp": 0.0, "ki": 0.0, "kd": 1.0, "derivative_delay": 1, "scale": 1.0}
     constraints = Constraints({"cost": 25.0}, tracker=tracker(free_steps=0, descent_steps=10_000))
     multiplier = PIDMultiplier(25.0, **gains, proportional_ema=0.0, derivative_ema=0.0)
-    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     found, targets = [], []
     for _ in range(5):
         costs = torch.full((20, 100, 1), 0.06)
-        state = constraints.update(TensorDict({"next": {"cost": costs}}, [20, 100]), episodes)
+        state = constraints.update(TensorDict({"next": {"cost": costs}}, [20, 100]), NOTHING_ENDED)
         multiplier.update(state)
         found.append(multiplier.value.item())
         targets.append(state.target.item())
@@ -154,10 +153,9 @@ def test_a_falling_limit_is_no_growth_of_the_cost():
 def test_predictions_per_step_are_held_against_the_costs_of_episodes():
     """Of 20 per episode half was realised, beside a first prediction of half of the limit."""
     constraints = Constraints({"cost": 25.0}, tracker=tracker())
-    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     for rate in (0.05, 0.04):
         costs = torch.full((20, 100, 1), rate)
-        state = constraints.update(TensorDict({"next": {"cost": costs}}, [20, 100]), episodes)
+        state = constraints.update(TensorDict({"next": {"cost": costs}}, [20, 100]), NOTHING_ENDED)
         constraints.record_prediction(state, {"cost_surrogate": torch.tensor([-20 / 1000])})
     prior = 0.9 * 12.5**2
     share = (prior + 20 * 10) / (prior + 20**2)
@@ -261,15 +259,14 @@ def test_batches_of_one_environment_need_their_dimension():
 @pytest.mark.parametrize("shape", [(3, 5), (3, 5, 2)])
 def test_costs_of_a_batch_need_their_last_dimension(shape):
     batch = TensorDict({"next": {"cost": torch.ones(shape)}}, [3, 5])
-    episodes = EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {})
     with pytest.raises(ValueError, match=r"must have the shape \[3, 5, 1\], got"):
-        Constraints({"cost": 1.0}, tracker=tracker()).update(batch, episodes)
+        Constraints({"cost": 1.0}, tracker=tracker()).update(batch, NOTHING_ENDED)
 
 
 def test_costs_in_another_order_than_those_of_the_multiplier_are_refused():
     state = Constraints({"a": 5.0, "b": 1.0}, tracker=tracker(5.0, 1.0)).update(
         TensorDict({"next": {key: torch.ones(3, 5, 1) for key in "ab"}}, [3, 5]),
-        EpisodeStatistics(NO_EPISODES, {}, NO_EPISODES, {}),
+        NOTHING_ENDED,
     )
     for limits in ({"a": 5.0, "b": 1.0}, [5.0, 1.0]):  # without names nobody knows
         ProjectedMultiplier(limits, init=0.0, lr=0.01, highest=None).update(state)
