@@ -11,11 +11,11 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -92,10 +92,10 @@ def prepare(words: Sequence[str]) -> list[str]:
     for word in words:
         if re.match(r"hydra\.(launcher|sweeper)=\w", word):
             raise ValueError(f"{word}: it is chosen with a slash, {word.replace('.', '/', 1)}.")
-    # Hydra itself takes overrides only where they stand together
-    overrides = get_args_parser().parse_intermixed_args(words).overrides
-    flags = [word for word in words if word not in overrides]
-    words = [word for word in words if word in overrides]
+    # Hydra's parser of flags takes overrides only where they stand together
+    pairs = list(pairwise(["", *words]))
+    flags = [word for before, word in pairs if _is_of_flags(before, word)]
+    words = [word for before, word in pairs if not _is_of_flags(before, word)]
     others = [word for word in words if word.startswith("env=")]
     if slates and (runs or others or len(slates) > 1):
         raise ValueError(
@@ -114,6 +114,13 @@ def prepare(words: Sequence[str]) -> list[str]:
             )
         new.append(f"env={','.join(SLATES[name])}")
     return [*new, *words, *flags]
+
+
+def _is_of_flags(before: str, word: str) -> bool:
+    """Whether a word is a flag of Hydra, or the value of the one before it."""
+    takes_any = re.fullmatch("-c[dnp]|--config-(dir|name|path)", before)
+    takes_plain = re.fullmatch("-[cip]|--(cfg|info|package|experimental-rerun)", before)
+    return word.startswith("-") or bool(takes_any or (takes_plain and "=" not in word))
 
 
 def job(config: DictConfig) -> float | None:
