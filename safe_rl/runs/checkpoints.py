@@ -200,9 +200,9 @@ class CheckpointStore:
 
         One that cannot be read may be the best, so it stays for the user to look at.
         """
-        readable = (path for path in checkpoints_in(self.best) if _score(path) > -math.inf)
-        ranked = sorted(readable, key=_score, reverse=True)
-        for worse in ranked[self._keep_best :]:
+        scores = {path: _score(path) for path in checkpoints_in(self.best)}
+        readable = [path for path, score in scores.items() if score > -math.inf]
+        for worse in sorted(readable, key=scores.__getitem__, reverse=True)[self._keep_best :]:
             if worse.name > after:
                 worse.unlink()
 
