@@ -290,11 +290,11 @@ def certify_finished(
         return
     reason = None
     if not has_tested_measure(config):
-        reason = f"there is no test for limits on {measure_of(config)}. For one of the mean cost"
+        reason = f"there is no test for limits on {measure_of(config)}. To test the mean cost"
     elif steps > whole_frames(config):
         reason = (
             f"frames={config.frames:_} are fewer than {steps:,}, a fifth of the steps of "
-            f"certificate.episodes={config.certificate.episodes} episodes. To make one all the same"
+            f"certificate.episodes={config.certificate.episodes} episodes. To test it all the same"
         )
     if reason is not None:
         given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
