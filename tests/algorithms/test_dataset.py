@@ -1,6 +1,7 @@
 """Datasets mean the same in every family: a clone does in the raw environment what they say."""
 
 import functools
+from types import SimpleNamespace
 
 import gymnasium
 import gymnasium_envs  # noqa: F401, registers Tank-v0
@@ -12,6 +13,7 @@ from torchrl.checkpoint import CheckpointError
 
 import safe_rl
 from safe_rl.algorithms import OffPolicy
+from safe_rl.algorithms.dataset import _smaller_actions
 from safe_rl.collectors import Recording, read_columns, read_recording, safety_gymnasium_columns
 from safe_rl.envs import make_env
 
@@ -118,6 +120,16 @@ def test_actions_of_a_file_are_in_the_environment_s_units(action, told, tmp_path
         return
     with pytest.raises(ValueError, match=told):
         learned_actions(tmp_path / "data.hdf5", env)
+
+
+def test_a_warning_names_actions_that_may_have_been_scaled():
+    actions = torch.tensor([[[0.9, -0.2], [-1.0, 0.4]]])
+    for width, is_named in ((2.0, True), (1.0, False)):
+        env = SimpleNamespace(
+            action_bounds=(torch.tensor([-width, 0.0]), torch.tensor([width, 1.0]))
+        )
+        assert ("rescale them if they were scaled" in _smaller_actions(actions, env)) == is_named
+        assert _smaller_actions(1.2 * actions, env) == ""
 
 
 def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
