@@ -62,6 +62,8 @@ def main():
             ]
         finally:
             subprocess.run([*git, "remove", "--force", older], check=True)
+    if not turns[0][1]:
+        sys.exit(f"{options.script} of {options.commit} prints no table with numbers.")
     print(f"| row | column | here | {options.commit} | here / {options.commit} |")
     print("|---|---|---|---|---|")
     for row, column in turns[0][0]:

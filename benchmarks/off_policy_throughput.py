@@ -144,7 +144,8 @@ def main() -> None:
         for _ in range(args.repeats):
             for name, call in calls.items():
                 taken[name].append(seconds(call))
-    print(f"{args.hidden}, minibatches of {args.batch_size}, {args.threads} threads")
+    print(f"{args.hidden}, minibatches of {args.batch_size}, {args.threads} threads\n")
+    print("| | updates/s | arithmetic alone | ratio |\n|---|---|---|---|")
     for kind, name in enumerate(("wall clock", "processor")):
         rates = {
             key: args.updates / statistics.median(times[kind] for times in values)
@@ -154,10 +155,8 @@ def main() -> None:
             bare[kind] / ours[kind]
             for ours, bare in zip(taken["updates"], taken["arithmetic"], strict=True)
         ]
-        print(
-            f"{name:10s}: {rates['updates']:7.1f} updates/s beside {rates['arithmetic']:7.1f} "
-            f"of arithmetic alone, ratio {statistics.median(ratios):.2f}"
-        )
+        cells = (*(f"{rate:.1f}" for rate in rates.values()), f"{statistics.median(ratios):.2f}")
+        print(f"| {name} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

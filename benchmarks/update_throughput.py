@@ -125,12 +125,13 @@ def main() -> None:
     for step in (TRPOStep(trpo, **TRUST_REGION), CPOStep(cpo, **TRUST_REGION)):
         updates[type(step).__name__] = functools.partial(step, batch, limits)
     print(f"{args.samples} samples, observation size {args.observation_size}, {HIDDEN}, "
-          f"{args.threads} threads; median of {args.repeats}")  # fmt: skip
+          f"{args.threads} threads; median of {args.repeats}\n")  # fmt: skip
+    print("| update | seconds | of processor time | backtracks |\n|---|---|---|---|")
     for name, update in updates.items():
         with fast_products():
             wall, processor, metrics = measure(from_the_start(update), args.repeats)
-        tries = f", {metrics['backtracks']} backtracks" if "backtracks" in metrics else ""
-        print(f"{name:40s} {wall:6.2f} s, {processor:6.2f} s of processor time{tries}")
+        tries = metrics.get("backtracks", "")
+        print(f"| {name} | {wall:.2f} | {processor:.2f} | {tries} |")
 
 
 if __name__ == "__main__":
