@@ -192,6 +192,8 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
     """A message about a key that the configuration, which OmegaConf's error has, does not have."""
     key, config = str(error.full_key), error.parent_node._get_root()
     section, known = key.partition(".")[0], keys_of(config)
+    if section == key:  # the whole section may be wrong, as in los.clip_epsilon=0.1
+        known += map(str, config)
     if section == "cost_limits":
         example = f"{{{key.partition('.')[2]}: 10}}"
         return (

@@ -26,6 +26,7 @@ WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
     "model._target_=my.nets": r"^there is no key .* yours takes is added: '\+model\._target_=…'\.$",
     "lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
+    "los.entropy_coeff=0.1": r"^there is no key 'los'\. Did you mean 'loss'\?$",
     "certificate={episodez: 5}": r"Did you mean '\S*certificate\.episodes'",
     "zzzzz=3": "^there is no key 'zzzzz'. '--cfg job' prints all of this algorithm and env",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
