@@ -19,14 +19,13 @@ from collections.abc import Mapping
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
-from torchrl.envs import EnvBase
 from torchrl.trainers import Trainer
 from torchrl.trainers.algorithms import PPOTrainer
 from torchrl.trainers.trainers import OptimizationStepper, ValueEstimatorHook
 
 from safe_rl.algorithms import Constraints, CPOStep, MinibatchUpdate
 from safe_rl.collectors import EpisodeAccounting, make_collector
-from safe_rl.envs import make_env
+from safe_rl.envs import ConstrainedEnv, make_env
 from safe_rl.models import make_actor, make_critic
 from safe_rl.objectives import (
     ActorCriticLoss,
@@ -45,7 +44,9 @@ DISCOUNT = {"gamma": 0.99, "lmbda": 0.97, "value_target": "lambda_return"}
 class Parts:
     """What both trainers share, for an environment and limits by cost key."""
 
-    def __init__(self, env: EnvBase, limits: Mapping[str, float], frames_per_batch: int) -> None:
+    def __init__(
+        self, env: ConstrainedEnv, limits: Mapping[str, float], frames_per_batch: int
+    ) -> None:
         size, keys = env.observation_spec["observation"].shape[-1], list(limits)
         layers = {"hidden_sizes": [64, 64], "device": env.device}
         self.actor = make_actor(size, env.action_spec.shape[-1], initial_log_std=-0.5, **layers)
@@ -96,7 +97,7 @@ class CPOStepper(OptimizationStepper):
 
 
 def ppo_lagrangian_trainer(
-    env: EnvBase, limits: Mapping[str, float], frames: int, frames_per_batch: int
+    env: ConstrainedEnv, limits: Mapping[str, float], frames: int, frames_per_batch: int
 ) -> PPOTrainer:
     """TorchRL's PPO trainer on the Lagrangian."""
     parts = Parts(env, limits, frames_per_batch)
@@ -127,7 +128,7 @@ def ppo_lagrangian_trainer(
 
 
 def cpo_trainer(
-    env: EnvBase, limits: Mapping[str, float], frames: int, frames_per_batch: int
+    env: ConstrainedEnv, limits: Mapping[str, float], frames: int, frames_per_batch: int
 ) -> Trainer:
     """TorchRL's trainer with a CPO step in place of its optimiser."""
     parts = Parts(env, limits, frames_per_batch)

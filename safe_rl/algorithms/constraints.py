@@ -166,10 +166,11 @@ class Constraints(Resumable):
             self.mean_length = episodes.decisions.mean().to(self.mean_length)
         costs, length = self.finished, self.mean_length
         has_finished = bool(length.isfinite())
+        is_known = has_finished or self._max_length is not None
         if not has_finished:
             length = torch.full_like(length, float(self._max_length or batch.shape[-1]))
         goes_by_rate = batch.shape[-1] < float(length)
-        if self.keys and (goes_by_rate or not has_finished) and (has_finished or self._max_length):
+        if self.keys and is_known and (goes_by_rate or not has_finished):
             rates = [batch["next", key].to(costs).mean() for key in self.keys]
             costs = torch.stack(rates) * length
         is_new = goes_by_rate or episodes.num_episodes > 0

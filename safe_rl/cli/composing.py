@@ -153,9 +153,10 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     if type(error) is AttributeError:
         raise error
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    if unknown := re.match(r"Could not override '([^']+)'\.", text):
-        if "No match in the defaults list" not in text:
-            return _unknown_key(cause, words)
+    unknown = re.match(r"Could not override '([^']+)'\.", text)
+    if unknown and cause is not error:
+        return _unknown_key(cause, words)
+    if unknown and "No match in the defaults list" in text:
         if f"--config-name={RESUMED}" in words:
             return f"{unknown[1]}: a continued run keeps its {unknown[1]}."
         if unknown[1] in General.__annotations__:

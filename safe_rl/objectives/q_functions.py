@@ -196,7 +196,7 @@ class QFunctionLoss(ReplayLoss):
         module = self._modules.get(params)
         source = getattr(module, "_param_td", None)
         known, leaves, places, value = cache.get(key, (None, [], [], None))
-        # after `p.data = …`, as of some optimisers, what is without gradients had the old numbers
+        # some optimisers assign `p.data`: views without gradients would keep the old numbers
         if known is None or known is not source or [p.data_ptr() for p in leaves] != places:
             leaves = [] if module is None else list(module.parameters())
             cache[key] = source, leaves, [p.data_ptr() for p in leaves], (value := compute())

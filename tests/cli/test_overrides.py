@@ -42,6 +42,7 @@ WRONG = {
     "evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
     "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\. To",
     "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
+    "logger@mine=none": r"^Could not override 'logger@mine'\. Did you mean to override logger\?",
     "slate=SG7": "Unknown slate 'SG7'",
     "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
     "frames=${nowhere}": "nowhere",
