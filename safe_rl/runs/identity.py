@@ -15,7 +15,6 @@ from enum import Enum
 from typing import Any
 
 import yaml
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
 from safe_rl.checks import is_number
@@ -203,19 +202,6 @@ def _hashable(value: Any) -> Hashable:
     if isinstance(value, Mapping):
         return tuple((key, _hashable(item)) for key, item in value.items())
     return tuple(map(_hashable, value)) if isinstance(value, list | tuple) else value
-
-
-def given_settings(overrides: Sequence[str], config: DictConfig) -> dict[str, Any]:
-    """Environment, algorithm and seed of a run, and the settings of its command line.
-
-    Keys that belong to the machine are left out. Lists and mappings are written as texts.
-    """
-    given = {}
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        key, value = override.key_or_group, override.value()
-        if role_of(key) is not Role.MACHINE:
-            given[key] = value if isinstance(value, bool | int | float | str) else str(value)
-    return given | {"env": config.env.name, "algo": config.algo.name, "seed": config.seed}
 
 
 def measure_of(settings: Any) -> str:

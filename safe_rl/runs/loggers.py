@@ -18,6 +18,7 @@ from torchrl.record.loggers.wandb import WandbLogger as TorchRLWandbLogger
 from safe_rl.checks import Text, checked
 from safe_rl.extras import import_extra
 from safe_rl.files import read_text, replace_text
+from safe_rl.runs.identity import flatten
 from safe_rl.runs.run import Run
 
 
@@ -70,6 +71,10 @@ class MLflowLogger(MLFlowLogger):
         )
         replace_text(path, run.info.run_id)
         return run
+
+    def log_hparams(self, cfg: Mapping[str, Any]) -> None:
+        """Log settings by their dotted keys: MLflow has no nested ones."""
+        super().log_hparams(flatten(cfg))
 
     def close(self, timeout: float | None = None) -> None:
         """End the MLflow run, so that this process can begin another one."""

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from safe_rl.checks import SettingError
 from safe_rl.files import is_plain, read_json, replace_json, replacing
 from safe_rl.runs.folder import lock_folder
-from safe_rl.runs.identity import given_settings, measure_of, whole_frames
+from safe_rl.runs.identity import measure_of, whole_frames
 from safe_rl.runs.progress_bar import ProgressBar
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import TableWriter, outcome_line, read_table
@@ -59,7 +59,9 @@ class RunWriter:
                 opened.callback(self._logger.close)
             self._table = TableWriter(self.run.table_file, keep_rows=epoch or 0)
             if self._logger is not None and not epoch:
-                self._logger.log_hparams(given_settings(self.run.overrides or (), self.config))
+                settings: Any = OmegaConf.to_container(self.config, resolve=True)
+                settings.pop("logger", None)  # an address may have a password
+                self._logger.log_hparams(settings)
             # whole batches, so that the last one does not go beyond the bar
             total, measure = whole_frames(self.config), measure_of(self.config)
             self._bar = opened.enter_context(

@@ -37,7 +37,9 @@ def test_mlflow_holds_the_table_and_continues_the_same_run(tmp_path):
         zip(table["steps"], table["policy_kl"], strict=True)
     )
     assert run.info.status == "FINISHED"
-    assert run.data.params == {"env": "PointMass", "algo": "ppo_lagrangian", "seed": "0"}
+    assert {"env.name": "PointMass", "frames": "640"}.items() <= run.data.params.items()
+    # the address of a server may have a password
+    assert not any(uri in value for value in run.data.params.values())
 
 
 def test_what_is_not_installed_is_named(tmp_path, monkeypatch):
@@ -58,7 +60,7 @@ class Scalars:
         self.steps.append(step)
 
     def log_hparams(self, cfg):
-        assert cfg["env"] == "PointMass"
+        assert cfg["env"]["name"] == "PointMass"
 
     def close(self):
         pass
