@@ -99,10 +99,11 @@ def pack_policy(run: Path, folder: Path, checkpoint: str = "certified") -> Path:
     kept.parent.mkdir(parents=True)
     for former in target.evaluation_files:  # of a policy that was exported there before
         former.unlink()
-    for name in (Run.config_file, Run.code_file, Run.robot_file, Run.certificate_file):
-        (folder / name).unlink(missing_ok=True)
-        if (run / name).is_file() and (is_certified or name != Run.certificate_file):
-            shutil.copyfile(run / name, folder / name)
+    for name in ("config_file", "code_file", "robot_file", "certificate_file"):
+        before, copy = getattr(source, name), getattr(target, name)
+        copy.unlink(missing_ok=True)
+        if before.is_file() and (is_certified or name != "certificate_file"):
+            shutil.copyfile(before, copy)
     if source.robot_folder.is_dir() and not source.robot_folder.is_symlink():
         shutil.copytree(source.robot_folder, target.robot_folder, symlinks=True)
     facts = {name: value for name, value in read_facts(path).items() if name != "run"}

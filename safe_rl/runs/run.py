@@ -22,16 +22,6 @@ KINDS = ("last", "best", "certified")
 """Folders of checkpoints: the newest, the best that kept every limit, the certified one."""
 
 
-class _Below:
-    """A file or folder of a run: ``run.table_file`` is its path, ``Run.table_file`` its name."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __get__(self, run: Run | None, kind: type[Run]) -> Path:
-        return Path(self._name) if run is None else run.directory / self._name
-
-
 class Run:
     """One training run.
 
@@ -52,25 +42,24 @@ class Run:
         (3, {'cost': 25.0})
     """
 
-    config_file = _Below("config.yaml")  # resolved
-    table_file = _Below("progress.csv")  # a row per epoch
-    curves_file = _Below("curves.png")  # the picture of its learning curves
-    failure_file = _Below("failure.txt")  # traceback of a failed job of a sweep
-    lock_file = _Below(".lock")  # keeps a second process from writing here; names the first
-    robot_folder = _Below("robot")  # copies of the files of a user's own robot
-    robot_file = _Below("robot.json")  # which robot that is, and its SHA-256
-    notes_folder = _Below(".hydra")  # Hydra's notes
-    overrides_file = _Below(".hydra/overrides.yaml")  # overrides of the command line
-    hydra_file = _Below(".hydra/hydra.yaml")  # Hydra's settings, and where the command was run
-    composed_file = _Below(".hydra/config.yaml")  # the configuration before it was resolved
-    code_file = _Below("code.json")  # versions of the code
-    checkpoints_folder = _Below("checkpoints")  # a folder for each of `KINDS`
-    transitions_folder = _Below("transitions")  # collected transitions, if they were recorded
-    certificate_file = _Below("certificate.json")  # which checkpoint is certified
-    tests_file = _Below("certificate_tests.json")  # the error that the tests of it have spent
-
     def __init__(self, directory: Path | str, **contents: Any) -> None:
-        self.directory = Path(directory)
+        folder = self.directory = Path(directory)
+        self.config_file = folder / "config.yaml"  # resolved
+        self.table_file = folder / "progress.csv"  # a row per epoch
+        self.curves_file = folder / "curves.png"  # the picture of its learning curves
+        self.failure_file = folder / "failure.txt"  # traceback of a failed job of a sweep
+        self.lock_file = folder / ".lock"  # keeps a second process from writing; names the first
+        self.robot_folder = folder / "robot"  # copies of the files of a user's own robot
+        self.robot_file = folder / "robot.json"  # which robot that is, and its SHA-256
+        self.notes_folder = folder / ".hydra"  # Hydra's notes:
+        self.overrides_file = self.notes_folder / "overrides.yaml"  # of the command line
+        self.hydra_file = self.notes_folder / "hydra.yaml"  # also where the command was run
+        self.composed_file = self.notes_folder / "config.yaml"  # before it was resolved
+        self.code_file = folder / "code.json"  # versions of the code
+        self.checkpoints_folder = folder / "checkpoints"  # a folder for each of `KINDS`
+        self.transitions_folder = folder / "transitions"  # if they were recorded
+        self.certificate_file = folder / "certificate.json"  # which checkpoint is certified
+        self.tests_file = folder / "certificate_tests.json"  # the error that its tests have spent
         # cached properties that are known already, as those of an archived run, which has no files
         vars(self).update(contents)
 
@@ -134,7 +123,7 @@ class Run:
             return None
         if self.certificate_of(path) is None:
             raise ValueError(
-                f"{path} is not the policy that {Run.certificate_file.name} is about: certify it "
+                f"{path} is not the policy that {self.certificate_file.name} is about: certify it "
                 "again."
             )
         return path
@@ -182,7 +171,7 @@ class Run:
         below = [str(run.directory) for run in find_runs(self.directory, most=1_000)[:5]]
         hint = f" Runs below it: {', '.join(below)}." if below else ""
         raise FileNotFoundError(
-            f"{self.directory} is not the folder of a run: no {Run.config_file.name}.{hint}"
+            f"{self.directory} is not the folder of a run: no {self.config_file.name}.{hint}"
         )
 
     # configuration
@@ -324,7 +313,8 @@ class Run:
 
 def find_runs(root: Path, most: int | None = None) -> list[Run]:
     """Runs below a folder, itself included, in the order of their paths; see `paths_below`."""
-    folders = (path.parent for path in paths_below(root, Run.config_file.name, most))
+    names = Run(root)
+    folders = (path.parent for path in paths_below(root, names.config_file.name, most))
     # Hydra and Weights & Biases write files of that name, too
-    others = (Run.notes_folder.name, "wandb/*run-*/files")
+    others = (names.notes_folder.name, "wandb/*run-*/files")
     return [Run(folder) for folder in folders if not any(map(folder.match, others))]
