@@ -14,7 +14,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from safe_rl.files import read_bounded, read_config, read_json, read_yaml
-from safe_rl.runs.folder import checkpoints_in, paths_below
+from safe_rl.runs.folder import checkpoints_in, paths_below, run_of
 from safe_rl.runs.identity import measure_of, unusable_keys
 from safe_rl.runs.table import MOST_BYTES, final_figures, measured, outcome_line, read_table
 
@@ -86,6 +86,7 @@ class Run:
 
         Raises:
             FileNotFoundError: If there is none; the message says why and what there is.
+            ValueError: If it is another run's.
         """
         if which not in KINDS:
             if not Path(which).exists():
@@ -93,6 +94,9 @@ class Run:
                     f"There is no checkpoint '{which}': checkpoint is last, best, certified or the "
                     "path of a file."
                 )
+            owner = Run(run_of(Path(which))[0])
+            if owner.is_run and owner.settings != self.settings:  # a copy of a run has the same
+                raise ValueError(f"{which} is a checkpoint of another run: name {owner.directory}.")
             return Path(which)
         from safe_rl.runs.checkpoints import best_checkpoint  # it needs torch
 

@@ -104,6 +104,19 @@ def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
     )
 
 
+def test_the_policy_of_another_run_is_not_evaluated_as_the_runs_own(run, capsys):
+    """Its figures would lie in the run's folder, and stand in its row of a report."""
+    other = run.parent / "other"
+    shutil.copytree(run, other)
+    theirs = max((other / "checkpoints" / "last").iterdir())
+    assert main([str(run), "episodes=1", f"checkpoint={theirs}"]) == 0  # of a copy
+    config = OmegaConf.load(other / "config.yaml")
+    config.seed += 1
+    OmegaConf.save(config, other / "config.yaml")
+    assert main([str(run), "episodes=1", f"checkpoint={theirs}"]) == 1
+    assert f"is a checkpoint of another run: name {other}." in capsys.readouterr().err
+
+
 def test_of_mappings_only_what_is_named_changes():
     """The others would go back to the environment's own, without a word."""
     cost = {"_target_": "mine.cost", "limit": 1.0}
