@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any
@@ -120,27 +120,19 @@ def catching_signals() -> Iterator[list[signal.Signals]]:
     ignored. Signals can only be caught in the main thread; in others the list stays empty.
     """
     received: list[signal.Signals] = []
-    previous: dict[int, signal._HANDLER] = {}
+    with ExitStack() as before:  # restores the handlers
 
-    def restore() -> None:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-        previous.clear()
+        def stop(number: int, frame: FrameType | None) -> None:
+            received.append(signal.Signals(number))
+            before.close()
+            # not print(): the signal may have interrupted one; the terminal may be closed
+            with suppress(OSError):
+                os.write(2, b"\nStopping after this epoch. Once more stops at once.\n")
 
-    def stop(number: int, frame: FrameType | None) -> None:
-        received.append(signal.Signals(number))
-        restore()
-        # not print(): the signal may have interrupted one; the terminal may be closed
-        with suppress(OSError):
-            os.write(2, b"\nStopping after this epoch. Once more stops at once.\n")
-
-    if threading.current_thread() is threading.main_thread():
-        # SIGINT is caught even if ignored, as in a shell's background job: kill -INT must work
-        ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-        hangup = set() if ignores_hangup else {signal.SIGHUP}
-        for number in {signal.SIGINT, signal.SIGTERM} | hangup:
-            previous[number] = signal.signal(number, stop)
-    try:
+        if threading.current_thread() is threading.main_thread():
+            # SIGINT is caught even if ignored, as in a shell's background job: kill -INT must work
+            ignores_hangup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            hangup = set() if ignores_hangup else {signal.SIGHUP}
+            for number in {signal.SIGINT, signal.SIGTERM} | hangup:
+                before.callback(signal.signal, number, signal.signal(number, stop))
         yield received
-    finally:
-        restore()
