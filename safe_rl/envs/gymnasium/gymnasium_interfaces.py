@@ -126,6 +126,12 @@ class Worlds:
         values = (column["reward"].astype(np.float64), column["terminated"], column["truncated"])
         return _arrays(step["observation"]), values, infos
 
+    def _first_infos(self) -> dict[str, np.ndarray]:
+        """Infos before the first step, with the keys of those of steps: costs of 0, no events."""
+        costs = dict.fromkeys((*self.batch.cost_keys, EPISODE_COST), np.float64)
+        kinds = costs | dict.fromkeys(self.batch.events, np.bool_)
+        return {key: np.zeros(self.batch.batch_size, kind) for key, kind in kinds.items()}
+
 
 class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
     """One simulated environment in Gymnasium's interface.
@@ -163,18 +169,13 @@ class WorldEnv(Worlds, gymnasium.Env[Any, np.ndarray]):
         """Start an episode; a seed determines this one and all later ones."""
         super().reset(seed=seed)
         self._seed(seed, self.np_random)
-        return _take(self._reset(np.ones(1, dtype=bool)), 0), {}
+        return _take(self._reset(np.ones(1, dtype=bool)), 0), _info(self._first_infos())
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Take one action [nu]."""
         observation, values, infos = self._step(np.asarray(action)[None])
         reward, terminated, truncated = (value[0].item() for value in values)
-        # TorchRL reads only what has a dtype from an info, and Gymnasium batches only numbers and
-        # arrays of NumPy; its booleans are not among these, so an event is an array without axes.
-        info = {
-            key: value[0] if value.dtype != bool else value[0, ...] for key, value in infos.items()
-        }
-        return _take(observation, 0), reward, terminated, truncated, info
+        return _take(observation, 0), reward, terminated, truncated, _info(infos)
 
     def render(self) -> np.ndarray | None:
         """Return a frame, uint8 [height, width, 3], in the mode "rgb_array"."""
@@ -262,7 +263,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         super().reset(seed=None if isinstance(seed, Sequence) else seed)
         self._seed(seed, self.np_random)
         self._ended[:] = False
-        return self._reset(~self._ended), {}
+        return self._reset(~self._ended), _with_masks(self._first_infos(), ~self._ended)
 
     def step(
         self, actions: np.ndarray
@@ -272,7 +273,7 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
         # Environments that start an episode in this step.
         begins = terminated | truncated if within else self._ended
-        reported = _with_masks(infos, ~begins)
+        reported = _with_masks(_choose(begins, self._first_infos(), infos), np.ones_like(begins))
         if within:
             reported |= _final_infos(observation, infos, begins)
         else:
@@ -312,6 +313,13 @@ def _take(observation: Observation, row: int) -> Observation:
     if isinstance(observation, dict):
         return {key: value[row] for key, value in observation.items()}
     return observation[row]
+
+
+def _info(infos: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The info of one environment, from arrays [1]."""
+    # TorchRL reads only what has a dtype from an info, and Gymnasium batches only numbers and
+    # arrays of NumPy; its booleans are not among these, so an event is an array without axes.
+    return {key: value[0, ...] if value.dtype == bool else value[0] for key, value in infos.items()}
 
 
 def _choose(mask: np.ndarray, chosen: Any, other: Any) -> Any:
