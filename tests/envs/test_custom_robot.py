@@ -155,6 +155,10 @@ SLIDE = '<jointpos name="east" joint="x"/></sensor>'
 WRONG = {
     "no XML": ("<mujoco><worldbody>", "cannot load"),
     "no robot": (changed(BALL, '"robot"', '"robto"'), "no body named 'robot'.*'robto'"),
+    "a floor": (
+        changed(BALL, "<worldbody>", '<worldbody><geom name="ground" type="plane" size="9 9 1"/>'),
+        r"belong to no body, \['ground'\]",
+    ),
     "robot inside another": (
         changed(changed(BALL, "<worldbody>", '<worldbody><body name="cart">'),
                 "</worldbody>", "</body></worldbody>").replace("<freejoint/>", ""),

@@ -22,7 +22,6 @@ import mujoco
 from safe_rl.envs.keys import ConfigError
 from safe_rl.envs.safety_gym.config import BUNDLED, PATHS_OF_2019, ROBOTS
 from safe_rl.files import read_bounded
-from safe_rl.naming import did_you_mean
 
 
 def fingerprint(path: Path) -> str:
@@ -107,10 +106,15 @@ def _faults(model: mujoco.MjModel, options: mujoco.MjsCompiler) -> Iterator[str]
                 f"has the control range [{low}, {high}]: every 'ctrlrange' must be finite, the "
                 "lower bound first."
             )
-    names = [model.body(i).name for i in range(1, model.nbody)]
-    if "robot" not in names:
-        hint = did_you_mean("robot", names) or f" Its bodies are {names}."
-        yield f"has no body named 'robot'.{hint} Give the root body this name."
+    bodies = [model.body(i) for i in range(1, model.nbody)]
+    if all(body.name != "robot" for body in bodies):
+        roots = [body.name for body in bodies if body.parentid[0] == 0]
+        yield f"has no body named 'robot': give its root body this name. In the file: {roots}."
+    if outside := [model.geom(i).name for i in range(model.ngeom) if not model.geom_bodyid[i]]:
+        yield (
+            f"has geoms that belong to no body, {outside}: remove them. The world has a floor, and "
+            "objects are given by keys."
+        )
     body = model.body("robot")
     if body.parentid[0] != 0:
         parent = model.body(body.parentid[0]).name
