@@ -59,6 +59,10 @@ def start(main: Callable[[], Any], words: Sequence[str] | None = None) -> None:
         if full_error == "1" or UNEXPECTED in getattr(error, "__notes__", ()):
             raise
         sys.exit(printable(explain(error, sys.argv[1:])))
+    except SystemExit as end:
+        if full_error == "1" and end.__cause__ is not None:  # `job` has made a line of it
+            raise end.__cause__ from end.__cause__.__cause__
+        raise
     except KeyboardInterrupt:
         end_by_interrupt()
     finally:
@@ -144,7 +148,7 @@ def job(config: DictConfig) -> float | None:
     except (OmegaConfBaseException, ValueError) as error:
         with suppress(OSError):
             directory.rmdir()  # Hydra has made it; a folder with files stays
-        sys.exit(printable(explain(error, sys.argv[1:])))
+        raise SystemExit(printable(explain(error, sys.argv[1:]))) from error
     from safe_rl.training.train import is_expected, train  # torch: help and errors do not need it
 
     try:
@@ -152,7 +156,7 @@ def job(config: DictConfig) -> float | None:
     except Exception as error:
         if not is_expected(error):
             raise
-        sys.exit(printable(" ".join(str(error).split())))
+        raise SystemExit(printable(" ".join(str(error).split()))) from error
     return None
 
 

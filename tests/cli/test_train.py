@@ -60,6 +60,8 @@ def test_the_whole_error_is_there_for_those_who_ask(command, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(Exception, match="Could not override 'lr'"):
         command("lr=1e-4")
+    with pytest.raises(ValueError, match="at least one entry"):
+        command("env=PointGoal1", "algo=cpo", "cost_limits={}", "num_envs=1")
 
 
 def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):

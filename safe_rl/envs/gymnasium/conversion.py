@@ -169,7 +169,7 @@ def _make_node(
     try:
         return _batch(make, config, num_envs, None if seed is None else spread_seed(seed), device)
     except _FAILURES as error:
-        raise ConfigError(f"env.id={config['id']}: {error}") from error
+        raise ConfigError(f"env.id={config['id']}: {str(error) or repr(error)}") from error
 
 
 def _describe_node(maker: _Maker, config: Mapping[str, Any]) -> tuple[list[str], int]:
@@ -178,7 +178,7 @@ def _describe_node(maker: _Maker, config: Mapping[str, Any]) -> tuple[list[str],
     try:
         return _describe(make, config)
     except _FAILURES as error:
-        raise ConfigError(f"env.id={config['id']}: {error}") from error
+        raise ConfigError(f"env.id={config['id']}: {str(error) or repr(error)}") from error
 
 
 def _describe(make: MakeEnv, config: Mapping[str, Any]) -> tuple[list[str], int]:
