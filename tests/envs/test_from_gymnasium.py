@@ -139,6 +139,19 @@ def test_an_entry_of_a_name_with_another_meaning_is_refused(name):
         from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=False)
 
 
+@pytest.mark.parametrize(
+    ("part", "flatten"),
+    [(gymnasium.spaces.Sequence(Box(0, 1)), True), (gymnasium.spaces.Text(4), False)],
+)
+def test_an_observation_without_numbers_is_named(part, flatten):
+    space = gymnasium.spaces.Dict(place=Box(0, 1), mission=part)
+    wrong = type("Wrong", (Counter,), {"observation_space": space})
+    with pytest.raises(
+        ConfigError, match=r"'mission' is observed, a (Sequence|Text), and networks"
+    ):
+        from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=flatten)
+
+
 def test_observed_choices_that_begin_at_another_number_are_refused_unless_flattened():
     class FromOne(Counter):
         observation_space = gymnasium.spaces.Dict(n=gymnasium.spaces.Discrete(3, start=1))

@@ -25,6 +25,7 @@ from safe_rl.envs.torchrl import TorchRLEnv
 from safe_rl.naming import did_you_mean
 
 _WRITTEN = ("action", "reward", "done", "terminated", "truncated")
+_NUMBERS = (Box, Discrete, MultiDiscrete, spaces.MultiBinary, spaces.Dict, spaces.Tuple)
 _Bool = bool | np.bool_
 COST_SUM = "cost_sum"  # Safety-Gymnasium's name for the sum of all kinds
 
@@ -45,6 +46,12 @@ def make_adapted(
     entries = dict(seen) if isinstance(seen, spaces.Dict) else {}
     if isinstance(actions, spaces.Tuple | spaces.Dict):
         raise ConfigError(f"Actions have several parts, {actions}: join them by a wrapper.")
+    for name, space in (entries or {"observation": seen}).items():
+        if not isinstance(space, (*_NUMBERS, spaces.Text) if flatten else _NUMBERS):
+            raise ConfigError(
+                f"'{name}' is observed, a {type(space).__name__}, and networks take numbers: leave "
+                "it out by a wrapper, such as Gymnasium's FilterObservation."
+            )
     if flatten:
         env = FlattenObservation(env)
     elif isinstance(seen, spaces.Tuple):
