@@ -64,7 +64,9 @@ def fill_replay_buffer(config: DictConfig, buffer: Memory, env: EnvBase) -> tupl
             f"{needed:,} (exploration.random_steps, memory.n_steps)."
         )
         return warning if frames < needed else "", True
-    node.path = str(Path(node.path).expanduser())
+    path = Path(node.path).expanduser()
+    file = path / "data" / "main_data.hdf5"  # in the folder of a dataset of Minari
+    node.path = str(file if file.is_file() else path)
     steps, interface = read_dataset(node.path), read_columns(node.path)
     try:
         learns_from = _fill(buffer, steps, interface, node, config.cost_limits, env)

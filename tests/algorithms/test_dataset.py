@@ -273,10 +273,12 @@ def test_paths_may_have_any_characters(tmp_path):
 
 
 def test_a_file_without_names_is_used_with_a_warning(tmp_path):
-    write_episodes(tmp_path / "data.hdf5", "Tank-v0", 0.5)
+    path, words = tmp_path / "data" / "main_data.hdf5", ("env.id=Tank-v0",)
+    path.parent.mkdir()
+    write_episodes(path, "Tank-v0", 0.5)
     env = make_tank()
-    path, words = tmp_path / "data.hdf5", ("env.id=Tank-v0",)
-    told = learner(path, env, *words, name="gymnasium").learns_from
+    told = learner(tmp_path, env, *words, name="gymnasium").learns_from  # as Minari has it
+    assert "main_data.hdf5: " in told
     assert "not name the columns" in told
     assert "transforms" not in told
     scale = "+transforms.scale={_target_: torchrl.envs.RewardScaling, loc: 0, scale: 0.01}"
