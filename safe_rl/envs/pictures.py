@@ -79,6 +79,17 @@ def load_backend() -> None:
     importlib.reload(gl_context)
 
 
+def release_context() -> None:
+    """Leave no OpenGL context of EGL current in this thread.
+
+    No other thread can draw with a context that is current here, or free it, even when this thread
+    has ended. MuJoCo would then free the textures and buffers of the same numbers in its present
+    context, which may be that of another environment, whose pictures would be wrong from then on.
+    """
+    if (egl := sys.modules.get("mujoco.egl")) is not None:
+        egl.EGL.eglReleaseThread()
+
+
 def _advice(error: Exception) -> str:
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
     name = backend if backend in PACKAGES else "glfw"
@@ -161,12 +172,23 @@ class Pictures(ABC):
                 f"There is no camera '{camera}'.{did_you_mean(camera, cameras)} "
                 f"Choose one of {[*cameras]}, or give a mujoco.MjvCamera."
             )
-        size = (width, height)
-        if size not in self._renderers:
-            self._renderers[size] = open_renderer(self.model, width, height)
-        renderer = self._renderers[size]
         chosen = cameras[camera] if isinstance(camera, str) else camera
-        renderer.update_scene(self.data, chosen, self.options)
+        try:
+            return self._draw(chosen, (width, height), markers, labels)
+        finally:
+            release_context()
+
+    def _draw(
+        self,
+        camera: mujoco.MjvCamera | str,
+        size: tuple[int, int],
+        markers: Iterable[Marker],
+        labels: Collection[str],
+    ) -> np.ndarray:
+        if size not in self._renderers:
+            self._renderers[size] = open_renderer(self.model, *size)
+        renderer = self._renderers[size]
+        renderer.update_scene(self.data, camera, self.options)
         self._label(renderer.scene, set(labels))
         drawn, upright = renderer.scene, np.eye(3).reshape(-1)
         for marker in list(markers)[: drawn.maxgeom - drawn.ngeom]:

@@ -1,7 +1,11 @@
 """What the robot's camera sees, as part of the observation."""
 
+import gc
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import mujoco
 import pytest
 import torch
 from pictures import make_env, needs_opengl
@@ -76,3 +80,39 @@ def test_every_environment_has_a_variant_with_vision():
     for name in (*SUITE, *debug):
         config = resolve(f"Safexp-{name}Vision-v0")
         assert config == resolve(name).replace(observe_vision=True, observation_flatten=False)
+
+
+def seen_at_reset(env):
+    env.set_seed(0)
+    return env.reset()["observation", "vision"].clone()
+
+
+@needs_opengl
+@pytest.mark.skipif(os.environ.get("MUJOCO_GL") != "egl", reason="other backends keep to a thread")
+def test_pictures_are_the_same_in_all_threads_and_after_the_end_of_other_environments():
+    first, later = (make_env({**VISION, "vision_size": (12, 8)}) for _ in range(2))
+    expected, made = seen_at_reset(first), []
+
+    def draw():
+        made.append(make_env({**VISION, "vision_size": (12, 8)}))
+        assert torch.equal(seen_at_reset(first), expected)
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(draw).result()
+    assert torch.equal(seen_at_reset(made[0]), expected)
+    assert torch.equal(seen_at_reset(later), expected)
+    made.clear()
+    gc.collect()
+    assert torch.equal(seen_at_reset(later), expected)
+
+
+@needs_opengl
+def test_closing_frees_what_the_camera_has_opened(monkeypatch):
+    closed = []
+    close = mujoco.Renderer.close
+    monkeypatch.setattr(mujoco.Renderer, "close", lambda self: (closed.append(self), close(self)))
+    env = make_env({**VISION, "vision_size": (12, 8)})
+    assert not closed
+    env.close()
+    assert [(renderer.width, renderer.height) for renderer in closed] == [(12, 8)]
+    closed.clear()

@@ -18,7 +18,7 @@ from safe_rl.envs.safety_gym.config import SafetyGymConfig
 from safe_rl.envs.safety_gym.costs import EXCEPTION_KEY, active_costs, compute_costs
 from safe_rl.envs.safety_gym.layouts import plan_placements
 from safe_rl.envs.safety_gym.observations import Privileged, make_observer, observation_spec
-from safe_rl.envs.safety_gym.renderer import WorldRenderer, vision_block
+from safe_rl.envs.safety_gym.renderer import Display, WorldRenderer, vision_block
 from safe_rl.envs.safety_gym.suite import resolve
 from safe_rl.envs.safety_gym.tasks import TASKS, dense_reward
 from safe_rl.envs.simulated import SimulatedEnv
@@ -103,7 +103,8 @@ class SafetyGymEnv(SimulatedEnv):
         shape = (num_envs, self._plan.num_columns, 2)
         self._fixed_layout = torch.zeros_like(self._world.step_count)
         self._layouts = rng.DrawnAhead(draw, shape, physics.device)
-        vision = [vision_block(scene)] if self.config.observe_vision else []
+        self._camera = Display(self.config)
+        vision = [vision_block(scene, self._camera)] if self.config.observe_vision else []
         self._observer = make_observer(scene, physics.device, vision)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
@@ -242,6 +243,11 @@ class SafetyGymEnv(SimulatedEnv):
     @cached_property
     def _renderer(self) -> WorldRenderer:
         return WorldRenderer(self._world)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the resources of OpenGL."""
+        self._camera.close()
+        super().close(raise_if_closed=raise_if_closed)
 
     def _read_state(self) -> TensorDict:
         world = self._world

@@ -82,8 +82,10 @@ def _numbers(values: torch.Tensor, row: int) -> np.ndarray:
     return values[row].cpu().numpy()
 
 
-def vision_block(scene: Scene) -> Block:
+def vision_block(scene: Scene, display: Display) -> Block:
     """Return the component `vision`: RGB in [0, 1], rows from top to bottom, [height, width, 3].
+
+    `display` draws it.
 
     Raises:
         ConfigError: If the robot has no camera of the name "vision".
@@ -96,7 +98,6 @@ def vision_block(scene: Scene) -> Block:
             f"'observe_vision': robot {config.robot_base!r} has no camera named '{VISION}'.{others}"
         )
     width, height = config.vision_size
-    display = Display(config)
 
     def read(world: World) -> Tensor:
         pixels = torch.empty(len(world.step_count), height, width, 3, dtype=torch.uint8)
