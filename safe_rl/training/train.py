@@ -167,9 +167,12 @@ def _ending_cleanly(run: Run, config: DictConfig) -> Iterator[None]:
         # torch raises a RuntimeError for main memory
         is_short = isinstance(error, MemoryError | torch.OutOfMemoryError)
         if is_short or re.search("allocat.* memory", str(error)):
+            # the replay buffer is first, because it is the largest by far
+            keys = ("memory.capacity", "frames_per_batch", "num_envs")
+            sizes = {key: OmegaConf.select(config, key) for key in keys}
+            named = ", ".join(f"{key}={size}" for key, size in sizes.items() if size is not None)
             raise MemoryError(
-                f"There is not enough memory with frames_per_batch={config.frames_per_batch}, "
-                f"num_envs={config.num_envs} and these networks: lower them."
+                f"There is not enough memory with {named} and these networks: lower them."
             ) from error
         raise
 

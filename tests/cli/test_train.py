@@ -184,6 +184,16 @@ def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypat
     assert words in line
 
 
+def test_a_replay_buffer_that_does_not_fit_is_named(command, monkeypatch):
+    def fail(trainer, batches):
+        raise MemoryError
+
+    monkeypatch.setattr(Trainer, "epoch", fail)
+    few = ("num_envs=2", "frames_per_batch=40", "frames=40", "memory.capacity=20_000")
+    (line,) = command("algo=sac", *few, "num_threads=1", "logger=none")[0].splitlines()
+    assert "memory with memory.capacity=20000, frames_per_batch=40, num_envs=2 and" in line
+
+
 def test_an_error_that_no_setting_explains_keeps_its_traceback(command, monkeypatch):
     def fail(trainer, batches):
         raise ValueError("shapes differ")
