@@ -58,6 +58,7 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
     it is EGL. The model's offscreen buffer is set to the size.
 
     Raises:
+        ValueError: If OpenGL has no buffer of this size.
         OpenGLError: If OpenGL is missing or cannot be started.
     """
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -65,6 +66,11 @@ def open_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
         load_backend()
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # every backend fails in its own way
+        if "framebuffer" in str(error):
+            raise ValueError(
+                f"OpenGL cannot draw {width} x {height} pixels here ({error}): choose a smaller "
+                "picture."
+            ) from error
         raise OpenGLError(_advice(error)) from error
 
 
@@ -163,7 +169,7 @@ class Pictures(ABC):
         Markers beyond the capacity of MuJoCo's scene are left out.
 
         Raises:
-            ValueError: For an unknown camera.
+            ValueError: For an unknown camera, or too many pixels.
             OpenGLError: If OpenGL is missing or cannot be started.
         """
         cameras = self.cameras

@@ -307,7 +307,7 @@ class SimulatedEnv(ConstrainedEnv):
 
         Raises:
             OpenGLError: If OpenGL is missing; the message names the package to install.
-            ValueError: For an unknown camera, or a frame without pixels.
+            ValueError: For an unknown camera, or a frame without pixels or with too many.
         """
         if min(width, height) < 1:
             raise ValueError(f"A frame needs at least one pixel, got {width} x {height}.")

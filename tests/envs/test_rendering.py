@@ -181,6 +181,14 @@ def test_a_missing_library_is_an_error_that_names_its_package(monkeypatch, backe
         make_env({}).render(0)
 
 
+@needs_opengl
+def test_a_picture_that_is_too_large_is_said_to_be():
+    env = make_env({})
+    with pytest.raises(ValueError, match=r"cannot draw 100000 x 1 pixels.*a smaller picture"):
+        env.render(0, width=100_000, height=1)
+    assert env.render(0, width=8, height=8).shape == (8, 8, 3)
+
+
 @pytest.mark.long
 @pytest.mark.skipif(bool(ctypes.util.find_library("OSMesa")), reason="OSMesa is installed here")
 def test_environments_work_where_opengl_is_missing():
