@@ -12,6 +12,7 @@ from pictures import make_env, needs_opengl
 from torchrl.envs.utils import check_env_specs
 
 import safe_rl.envs
+from safe_rl.collectors import match_columns
 from safe_rl.envs import EXTRAS, SUITE, ConfigError, SafetyGymEnv, resolve
 
 VISION = {"observe_vision": True, "observation_flatten": False}
@@ -116,3 +117,14 @@ def test_closing_frees_what_the_camera_has_opened(monkeypatch):
     env.close()
     assert [(renderer.width, renderer.height) for renderer in closed] == [(12, 8)]
     closed.clear()
+
+
+def test_columns_of_a_turned_picture_are_others():
+    upright, turned = (
+        safe_rl.envs.make_env("PointGoal1Vision", vision_size=size).interface
+        for size in ((4, 6), (6, 4))
+    )
+    assert upright["columns"] == turned["columns"]
+    assert upright["sensors"]["vision_size"] == [4, 6]
+    with pytest.raises(ValueError, match=r"their vision_size is \[4, 6\].*environment \[6, 4\]"):
+        match_columns(*(x for key in ("columns", "sensors") for x in (upright[key], turned[key])))

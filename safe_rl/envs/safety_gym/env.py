@@ -126,9 +126,12 @@ class SafetyGymEnv(SimulatedEnv):
 
     @property
     def sensor_keys(self) -> dict[str, Any]:  # type: ignore[override]
-        """Keys that change the readings of lidars, but not their number."""
+        """Keys that change readings of lidars and the shape of pictures, but not their number."""
         has_lidar = any(name.endswith("_lidar") for name in self.observation_layout)
-        return {key: getattr(self.config, key) for key in _LIDAR if has_lidar}
+        keys = {key: getattr(self.config, key) for key in _LIDAR if has_lidar}
+        if self.config.observe_vision:  # as a list, which JSON has
+            keys["vision_size"] = [*self.config.vision_size]
+        return keys
 
     def _set_seed(self, seed: int | None, rows: slice = slice(None)) -> None:
         super()._set_seed(seed, rows)
