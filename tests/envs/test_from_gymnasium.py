@@ -152,6 +152,23 @@ def test_an_observation_without_numbers_is_named(part, flatten):
         from_gymnasium(wrong, cost_keys=["cost"], num_steps=3, flatten=flatten)
 
 
+def test_a_picture_that_is_flattened_is_told():
+    space = Box(0, 255, (4, 4, 3), np.uint8)
+
+    class Seen(Counter):
+        observation_space = space
+
+        def reset(self, **options):
+            return space.low, super().reset(**options)[1]
+
+        def step(self, action):
+            return space.high, *super().step(action)[1:]
+
+    with pytest.warns(UserWarning, match=r"'observation' is a picture, \(4, 4, 3\)"):
+        env = from_gymnasium(Seen, cost_keys=["cost"], num_steps=3, seed=0)
+    assert env.rollout(1)["next", "observation"].unique().tolist() == [255.0]
+
+
 def test_observed_choices_that_begin_at_another_number_are_refused_unless_flattened():
     class FromOne(Counter):
         observation_space = gymnasium.spaces.Dict(n=gymnasium.spaces.Discrete(3, start=1))

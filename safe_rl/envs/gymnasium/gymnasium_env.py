@@ -52,6 +52,12 @@ def make_adapted(
                 f"'{name}' is observed, a {type(space).__name__}, and networks take numbers: leave "
                 "it out by a wrapper, such as Gymnasium's FilterObservation."
             )
+        if flatten and space.dtype == np.uint8 and len(space.shape or ()) > 1:
+            warnings.warn(
+                f"'{name}' is a picture, {space.shape}: as a part of a vector it is not scaled. "
+                "flatten=false keeps pictures, for model=cnn or model=dict.",
+                stacklevel=2,
+            )
     if flatten:
         env = FlattenObservation(env)
     elif isinstance(seen, spaces.Tuple):
