@@ -11,7 +11,6 @@ from point_mass import PointMass
 from run_configs import CONF, compose_config, nodes
 
 from safe_rl import trust
-from safe_rl.algorithms import OnPolicy
 from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.checks import is_setting, parameters_of
@@ -243,12 +242,6 @@ def test_a_robot_of_ones_own_has_the_numbers_of_point():
     assert (config.frames, config.num_envs, config.frames_per_batch) == (10_000_000, 30, 30_000)
 
 
-def test_cost_limits_on_the_command_line_replace_the_default():
-    assert compose_config().cost_limits == {"cost": 25.0}
-    config = compose_config("cost_limits={cost_hazards: 10, cost_vases_contact: 5}")
-    assert config.cost_limits == {"cost_hazards": 10, "cost_vases_contact": 5}
-
-
 def test_cost_limits_must_name_costs_of_the_environment():
     keys = ["cost", "cost_hazards", "cost_vases_contact"]
     assert check_cost_limits({"cost_hazards": 10}, keys) == {"cost_hazards": 10.0}
@@ -256,5 +249,3 @@ def test_cost_limits_must_name_costs_of_the_environment():
         check_cost_limits({"cost_hazard": 10}, keys)
     with pytest.raises(ValueError, match=r"no such cost\. It has cost, "):  # nothing like it
         check_cost_limits({"cost_pillars": 10}, keys)
-    with pytest.raises(ValueError, match="Without constraints use algo=ppo"):
-        OnPolicy.from_config(compose_config("env=PointMass", "cost_limits={}"), PointMass(2))

@@ -1,6 +1,5 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -45,6 +44,7 @@ def test_configurations_are_shown(command):
             ["loss._target_=safe_rl.objectives.PPOLoss", "~loss.cost_clipping"],
             "lagrangian: safe_rl.objectives.PPOLoss has no argument 'multiplier'",
         ),
+        (["algo=cpo", "cost_limits={}", "hydra.run.dir=a/b"], "algo=cpo needs at least one entry"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line_and_leaves_nothing(command, overrides, words):
@@ -68,14 +68,6 @@ def test_a_batch_that_the_machine_cannot_hold_is_refused(command, monkeypatch):
     monkeypatch.setattr("safe_rl.training.building.os.sysconf", lambda name: 100)
     status, *_ = command(*SMALL, "frames=40")
     assert status == "frames_per_batch=40: a batch takes 0 GB, and there are 0 GB."
-
-
-def test_a_run_that_cannot_be_built_leaves_no_file(command):
-    refused = ("env=PointGoal1", "algo=cpo", "cost_limits={}", "logger=none", "num_envs=1")
-    Path("mine").mkdir()
-    for where in ((), ("hydra.run.dir=mine/runs/first",)):
-        assert "algo=cpo needs at least one entry" in command(*refused, *where)[0]
-        assert not [path for path in Path.cwd().rglob("*") if path.is_file()]
 
 
 @pytest.mark.parametrize(("overrides", "lines"), [([], 1), (["certificate.episodes=0"], 0)])
@@ -144,17 +136,7 @@ def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed
     status, out, _ = command(resume)
     assert status == 0
     assert "40 frames already. To train on: " in out
-    written = Path("runs/mine/certificate.json")
-    assert written.exists()
-    written.unlink()
-    # a finished run without a certificate gets one when it is asked for
-    for episodes, is_certified in ((0, False), (100, False), (3, True)):
-        status, out, _ = command(resume, f"certificate.episodes={episodes}")
-        assert status == 0
-        assert "40 frames already. To train on: " in out
-        assert ("fewer than 400, a fifth" in out) == (episodes == 100)
-        assert written.exists() == is_certified
-    assert json.loads(written.read_text())["most_episodes"] == 3
+    assert Path("runs/mine/certificate.json").exists()
 
 
 @pytest.mark.long
