@@ -28,20 +28,6 @@ def row(epoch, episode_return, cost, north_cost=0.0):
     }
 
 
-def test_final_figures_are_means_of_the_last_five_epochs_with_episodes():
-    table = {
-        "episode_return": [100.0, 1.0, 2.0, NAN, 3.0, 4.0, 5.0],
-        "episode_cost": [900.0, 10.0, 20.0, NAN, 30.0, 40.0, 50.0],
-        "cost_rate": [9.0, 8.0, 7.0, 6.0, 5.0, 4.0, 0.03],
-        "steps": [10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0],
-        "time_total": [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 35.0],
-    }
-    final = final_figures(table, ["cost"])
-    assert final == {
-        "episode_return": 3.0, "episode_cost": 30.0, "cost_rate": 0.03, "steps_per_second": 2.0,
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("epoch", "epochs", "width"),
     [(20_000, 50, 5), (30_000, 30, 5), (5_000, 200, 20), (5_000, 40, 8), (1_000, 7, 5), (10, 3, 3)],
@@ -58,11 +44,6 @@ def test_algorithms_with_short_epochs_are_judged_by_as_many_steps(epoch, epochs,
     final = final_figures(table, ["cost"])
     assert final["episode_return"] == pytest.approx(sum(numbers[-width:]) / width)
     assert final["episode_cost"] == pytest.approx(2 * final["episode_return"])
-
-
-def test_final_figures_without_any_episode_are_nan():
-    table = {"episode_return": [NAN], "steps": [10.0], "time_total": [1.0]}
-    assert math.isnan(final_figures(table, [])["episode_return"])
 
 
 def test_the_folder_has_configuration_table_and_tensorboard(tmp_path, capsys, curves):
