@@ -94,10 +94,3 @@ def test_keys_at_their_defaults_may_be_left_out():
     changed = {k: v for k, v in NODE.items() if k == "name" or BENCHMARK.defaults.get(k) != v}
     assert len(changed) < len(NODE) / 2
     assert BENCHMARK.name_of(changed) == "PointGoal1"
-
-
-def test_changes_are_named():
-    node = {**NODE, "layout_seeds": 10, "hazards_size": 0.3}
-    assert BENCHMARK.changes(node) == {"layout_seeds": 10, "hazards_size": 0.3}
-    assert BENCHMARK.changes({**NODE, "name": "Mine"}) is None
-    assert BENCHMARK.name_of({**NODE, "layout_seeds": 10}) is None
