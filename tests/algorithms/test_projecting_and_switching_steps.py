@@ -64,15 +64,16 @@ def test_constraints_may_depend_on_each_other(excess, gram, nu):
 
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])
-@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5])
+@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5, 1e4])
 def test_pcpo_is_the_equation_of_its_article(projection, violation):
+    """A second limit, which is far away, changes nothing."""
     actor, batch = make_case()
-    batch["cost_advantage"] = batch["cost_advantage"][:, :1]
     matrix = dense_fisher(actor, batch)
     step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), projection=projection, **SETTINGS)
     losses = step.loss(batch)
     g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
-    taken, _ = whole_step(step, batch, limit_state(violation))
+    taken, metrics = whole_step(step, batch, limit_state(violation, -1e4))
+    assert metrics["kl"] <= DELTA * 1.001
     h_g = torch.linalg.solve(matrix, g)
     first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
     back = torch.linalg.solve(matrix, b) if projection == "kl" else b
@@ -81,23 +82,6 @@ def test_pcpo_is_the_equation_of_its_article(projection, violation):
     torch.testing.assert_close(
         taken.double(), radius * expected, atol=2e-3 * expected.abs().max(), rtol=1e-2
     )
-
-
-@pytest.mark.parametrize("projection", ["kl", "l2"])
-@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5, 1e4])
-def test_pcpo_keeps_the_trust_region_and_lowers_costs_outside(projection, violation):
-    actor, batch = make_case()
-    loss = CPOLoss(actor, entropy_coeff=0.0)
-    step = PCPOStep(loss, projection=projection, **SETTINGS)
-    before = loss(batch)
-    metrics = step(batch, limit_state(violation, -1e4))
-    after = loss(batch)
-    assert metrics["step_fraction"] > 0
-    assert after["kl"] <= DELTA * 1.001
-    change = after["cost_surrogate"][0] - before["cost_surrogate"][0]
-    assert change <= max(-violation / 100, 0.0) + 1e-6
-    if violation > 0:
-        assert change < 0
 
 
 @pytest.mark.parametrize(
