@@ -10,7 +10,6 @@ from safe_rl.collectors.recording import read_recording
 from safe_rl.envs import make_env
 from safe_rl.evaluation import certify
 from safe_rl.evaluation.loading import maker_of
-from safe_rl.evaluation.policies import pack_policy
 from safe_rl.evaluation.settings import certificate_options
 from safe_rl.models import RunningScale, update_running_scales
 
@@ -136,15 +135,6 @@ def test_a_policy_is_certified_without_it(tmp_path):
     assert certificate.verdict.bounds["mean_cost"][0] < 15
     assert made
     assert not any(env.privileged_layout for env in made)
-
-
-@pytest.mark.long
-def test_an_exported_policy_does_not_need_it(tmp_path):
-    run = train(tmp_path / "run", "sac", **READ)
-    pack_policy(run.directory, tmp_path / "packed", "last")
-    policy = safe_rl.load(tmp_path / "packed").policy
-    step = make(known=False).reset()
-    assert policy(step)["action"].shape == (4, 2)
 
 
 @pytest.mark.long

@@ -153,11 +153,6 @@ def test_the_folder_of_a_run(tmp_path):
     assert line.endswith(str(tmp_path))
 
 
-def test_nothing_is_best_while_a_limit_is_broken(tmp_path):
-    train(tmp_path, "frames=480", "algo=ppo", "cost_limits={cost: 1000, cost_hazards: 0}")
-    assert not (tmp_path / "checkpoints" / "best").exists()
-
-
 def test_epochs_without_a_finished_episode(tmp_path, curves):
     words = ("limits=null", "staggered_starts=null", "frames=800")
     _, table = train(tmp_path, *words, num_steps=100)
