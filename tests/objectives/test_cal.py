@@ -4,32 +4,21 @@ from dataclasses import replace
 
 import pytest
 import torch
+from q_losses import lagrange
+from q_losses import make_loss as make_q_loss
 from tensordict import TensorDict
-from torchrl.data import Bounded
 
-from safe_rl.models import QEnsemble, make_squashed_actor
-from safe_rl.objectives import CALLoss, LagrangeMultiplier, LimitState
+from safe_rl.objectives import LimitState
 from safe_rl.objectives.sac import discounted_share
 
-COSTS = ["cost", "cost_other"]
+
+def make_loss(init=(2.0, 0.5), **keys):
+    keys = {"ratio_memory": 0.5, **keys}
+    return make_q_loss("cal", lagrange(*init), networks=4, is_prepared=False, **keys)
 
 
-def make_loss(kind=CALLoss, init=(2.0, 0.5), **keys):
-    if kind is CALLoss:
-        keys = {"convexity": 10.0, "ratio_memory": 0.5, "largest_ratio": 2.0, **keys}
-    keys = {"gamma": 0.9, "alpha_init": 0.2, "action_spec": Bounded(-1, 1, [2]), **keys}
-    return kind(
-        make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]),
-        QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
-        QEnsemble(3, 2, hidden_sizes=[8], num_networks=4, num_outputs=2, out_key="costs"),
-        multiplier=LagrangeMultiplier(dict(zip(COSTS, (25.0, 10.0), strict=True)), init=init, lr=1),
-        cost_keys=COSTS,
-        **keys,
-    )
-
-
-def prepare(loss, costs, limits=(25.0, 10.0), unit=(1.0, 1.0)):
-    state = LimitState.of(cost=costs, limit=limits, length=1000.0)
+def prepare(loss, costs, unit=(1.0, 1.0)):
+    state = LimitState.of(cost=costs, limit=[25.0, 10.0], length=1000.0)
     rewards = TensorDict({"next": {"reward": torch.zeros(2, 3, 1)}}, [2, 3])
     loss.prepare(rewards, replace(state, unit=torch.tensor(unit)))
 
@@ -55,7 +44,7 @@ def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
         action = dist.rsample()
         inputs = steps.clone().set("action", action)
         reward = loss.qvalue_network(inputs)["state_action_value"].min(0).values.squeeze(-1)
-        values = loss.cost_qvalue_network(inputs)["costs"]
+        values = loss.cost_qvalue_network(inputs)["cost_value"]
         spread = (values - values.mean(0)).square().mean(0).sqrt()
         charged = (values.mean(0) + 0.5 * spread).mean(0)
         return (0.2 * dist.log_prob(action) - reward).mean(), charged
