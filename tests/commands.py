@@ -15,7 +15,7 @@ from safe_rl.cli import train
 from safe_rl.cli.composing import compose_run
 from safe_rl.cli.config import check_settings
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
     *("env.num_steps=20", "num_envs=2", "frames_per_batch=40", "logger=none", "num_threads=1"),
     "model.hidden_sizes=[8]",

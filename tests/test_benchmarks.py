@@ -1,13 +1,11 @@
 """The scripts of `benchmarks/` and `examples/` still find what they import, and measure."""
 
 import runpy
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from commands import ROOT, in_a_process
 
-ROOT = Path(__file__).parents[1]
 SCRIPTS = [*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/[rt]*.py")]
 
 
@@ -45,6 +43,4 @@ def test_scripts_measure(words, monkeypatch, capsys):
 def test_a_script_composes_a_run_in_a_process_of_its_own():
     """Other tests of this process may have put into Hydra's store what the script forgot."""
     code = "from train_throughput import compose_config; print(compose_config(['algo=cpo']).seed)"
-    command = [sys.executable, "-c", code]
-    result = subprocess.run(command, cwd=ROOT / "benchmarks", capture_output=True, text=True)
-    assert result.stdout == "0\n", result.stderr
+    assert in_a_process("-c", code, cwd=ROOT / "benchmarks") == "0\n"

@@ -1,16 +1,16 @@
 """What a memory gives back: the transitions that went in, over one step or over several."""
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
+from commands import ROOT
 from tensordict import TensorDict
 from torchrl.envs import MultiStepTransform
 
 from safe_rl.algorithms import Memory
 
-PAGE = Path(__file__).parents[2] / "docs/coming_from/torchrl.md"
+PAGE = ROOT / "docs/coming_from/torchrl.md"
 IN_KEYS = [
     *("observation", "action"),
     *(("next", key) for key in ("observation", "reward", "cost", "terminated", "done")),

@@ -4,15 +4,13 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+from commands import ROOT
 
 from safe_rl.collectors.workers import starting_processes
 
 pytestmark = pytest.mark.long
-
-ROOT = Path(__file__).parents[2]
 
 # a parent that starts a child, which says when it watches and when it gets SIGTERM
 PARENT = """

@@ -1,11 +1,11 @@
 """The algorithms' pages, and what pages ask the site to make: `<!-- made: measured ppo -->`."""
 
 import re
-from pathlib import Path
 
+from commands import ROOT
 from run_configs import CONF
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = ROOT / "docs"
 ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
 
 

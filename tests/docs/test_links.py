@@ -1,11 +1,10 @@
 """Links between files in Markdown, as they stand on GitHub: every one leads somewhere."""
 
 import re
-from pathlib import Path
 
 import pytest
+from commands import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted(
     path.relative_to(ROOT)
     # not what a report writes below results/

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from commands import composed
+from commands import ROOT, composed
 from registrations import undone
 
 from safe_rl import trust
@@ -22,7 +22,6 @@ from safe_rl.cli.report import ReportOptions
 from safe_rl.evaluation import EvaluationOptions
 from safe_rl.evaluation.settings import check_options
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
 # snippets that have tests of their own, with more to say
 TESTED_ELSEWHERE = ("README.md", "docs/algorithms")

@@ -1,14 +1,13 @@
 """README is one page, with the two commands that CI and readers carry out."""
 
 import re
-from pathlib import Path
 
 import render_suite
+from commands import ROOT
 from PIL import Image
 
 from safe_rl.envs.families import env_names
 
-ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text()
 FAMILIES = ROOT / "docs" / "environments" / "suite.md"
 

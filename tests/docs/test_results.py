@@ -1,14 +1,12 @@
 """Tables and sentences on results are those of the archived runs."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pandas
 import pytest
 import result_tables as results
-
-ROOT = Path(__file__).resolve().parents[2]
+from commands import ROOT
 
 
 def said(page):

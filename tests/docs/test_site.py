@@ -1,19 +1,18 @@
 """What the site makes: tables, links out of `docs/`, its navigation."""
 
 import re
-from pathlib import Path
 
 import environment_tables
 import links
 import marks
 import pytest
 import yaml
+from commands import ROOT
 
 from safe_rl.envs import SUITE
 from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.envs.safety_gym.costs import COSTS
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 

@@ -50,24 +50,18 @@ def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "places"),
-    [
-        ([], ["evaluation.json"]),
-        (["picture=there.gif"], ["../there.gif"]),
-    ],
+    ("arguments", "place"), [([], "evaluation.json"), (["picture=there.gif"], "../there.gif")]
 )
 def test_what_cannot_be_written_is_said_before_any_episode(
-    arguments, places, run, capsys, monkeypatch
+    arguments, place, run, capsys, monkeypatch
 ):
     monkeypatch.chdir(run.parent)
     monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
-    for place in places:
-        (run / place).mkdir()
-        assert main([str(run), *arguments]) == 1
-        error = capsys.readouterr().err.splitlines()[-1]
-        assert error.startswith("error: ")
-        assert f"{place.removeprefix('../')} is a folder, where a file is to be written." in error
-        (run / place).rmdir()
+    (run / place).mkdir()
+    assert main([str(run), *arguments]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ")
+    assert f"{place.removeprefix('../')} is a folder, where a file is to be written." in error
 
 
 def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, monkeypatch):

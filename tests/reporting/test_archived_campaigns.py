@@ -2,15 +2,15 @@
 
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import ROOT
 
 from safe_rl.reporting.archive import RUNS as FILE
 from safe_rl.reporting.archive import find_runs, read_archive
 
-RESULTS = Path(__file__).parents[2] / "results"
+RESULTS = ROOT / "results"
 PAGE = (RESULTS / "README.md").read_text()
 ALL_ROWS = re.findall(r"^\| `(\S+/seed\d+)` \| (.*) \|$", PAGE, re.MULTILINE)
 QUARTERS = [(run, row) for run, row in ALL_ROWS if "/limit" in run]
