@@ -64,21 +64,30 @@ def test_constraints_may_depend_on_each_other(excess, gram, nu):
 
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])
-@pytest.mark.parametrize("violation", [-1e4, -1.0, 0.5, 1e4])
-def test_pcpo_is_the_equation_of_its_article(projection, violation):
-    """A second limit, which is far away, changes nothing."""
+@pytest.mark.parametrize(
+    "violations", [(-1e4, -1e4), (-1.0, -1e4), (0.5, -1e4), (1e4, -1e4), (0.5, 0.2)]
+)
+def test_pcpo_is_the_equation_of_its_article(projection, violations):
+    """With two limits the projection is the one whose multipliers are not negative."""
     actor, batch = make_case()
     matrix = dense_fisher(actor, batch)
     step = PCPOStep(CPOLoss(actor, entropy_coeff=0.0), projection=projection, **SETTINGS)
     losses = step.loss(batch)
-    g, b = flat_gradients(actor, losses["loss_objective"], losses["cost_surrogate"][0])
-    taken, metrics = whole_step(step, batch, limit_state(violation, -1e4))
+    g, *gradients = flat_gradients(actor, losses["loss_objective"], *losses["cost_surrogate"])
+    taken, metrics = whole_step(step, batch, limit_state(*violations))
     assert metrics["kl"] <= DELTA * 1.001
     h_g = torch.linalg.solve(matrix, g)
     first = -(2 * DELTA / (g @ h_g)).sqrt() * h_g
-    back = torch.linalg.solve(matrix, b) if projection == "kl" else b
-    expected = first - max(0.0, ((b @ first + violation / 100) / (b @ back)).item()) * back
-    expected *= (2 * DELTA / (expected @ matrix @ expected)).sqrt().clamp_max(1.0)
+    b, c = torch.stack(gradients), torch.tensor(violations).to(first) / 100
+    back = (torch.linalg.solve(matrix, b.T) if projection == "kl" else b.T).T
+    projected = []
+    for active in ([], [0], [1], [0, 1]):
+        nu = torch.linalg.solve(b[active] @ back[active].T, b[active] @ first + c[active])
+        point = first - nu @ back[active]
+        if (nu >= 0).all() and (b @ point + c <= 1e-9).all():
+            projected.append(point)
+    (expected,) = projected
+    expected = expected * (2 * DELTA / (expected @ matrix @ expected)).sqrt().clamp_max(1.0)
     torch.testing.assert_close(
         taken.double(), expected, atol=2e-3 * expected.abs().max(), rtol=1e-2
     )
