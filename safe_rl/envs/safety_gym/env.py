@@ -103,8 +103,8 @@ class SafetyGymEnv(SimulatedEnv):
         shape = (num_envs, self._plan.num_columns, 2)
         self._fixed_layout = torch.zeros_like(self._world.step_count)
         self._layouts = rng.DrawnAhead(draw, shape, physics.device)
-        self._camera = Display(self.config)
-        vision = [vision_block(scene, self._camera)] if self.config.observe_vision else []
+        self._camera = Display(self.config) if self.config.observe_vision else None
+        vision = [] if self._camera is None else [vision_block(scene, self._camera)]
         self._observer = make_observer(scene, physics.device, vision)
         self._task = TASKS[self.config.task]
         self._measured = self._task.measure(self._world).detach().clone()
@@ -249,7 +249,8 @@ class SafetyGymEnv(SimulatedEnv):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the resources of OpenGL."""
-        self._camera.close()
+        if self._camera is not None:
+            self._camera.close()
         super().close(raise_if_closed=raise_if_closed)
 
     def _read_state(self) -> TensorDict:
