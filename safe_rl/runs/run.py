@@ -96,7 +96,9 @@ class Run:
                 )
             owner = Run(run_of(Path(which))[0])
             if owner.is_run and owner.settings != self.settings:  # a copy of a run has the same
-                raise ValueError(f"{which} is a checkpoint of another run: name {owner.directory}.")
+                raise ValueError(
+                    f"{which} is a checkpoint of another run, {owner.directory}: name that run."
+                )
             return Path(which)
         from safe_rl.runs.checkpoints import best_checkpoint  # it needs torch
 

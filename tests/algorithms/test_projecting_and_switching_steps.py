@@ -65,7 +65,7 @@ def test_constraints_may_depend_on_each_other(excess, gram, nu):
 
 @pytest.mark.parametrize("projection", ["kl", "l2"])
 @pytest.mark.parametrize(
-    "violations", [(-1e4, -1e4), (-1.0, -1e4), (0.5, -1e4), (1e4, -1e4), (0.5, 0.2)]
+    "violations", [(-1e4, -1e4), (-1.0, -1e4), (0.5, -1e4), (1e4, -1e4), (0.5, 2.0)]
 )
 def test_pcpo_is_the_equation_of_its_article(projection, violations):
     """With two limits the projection is the one whose multipliers are not negative."""

@@ -108,7 +108,7 @@ def test_the_policy_of_another_run_is_not_evaluated_as_the_runs_own(run, capsys)
     config.seed += 1
     OmegaConf.save(config, other / "config.yaml")
     assert main([str(run), "episodes=1", f"checkpoint={theirs}"]) == 1
-    assert f"is a checkpoint of another run: name {other}." in capsys.readouterr().err
+    assert f"is a checkpoint of another run, {other}: name that run." in capsys.readouterr().err
 
 
 def test_of_mappings_only_what_is_named_changes():

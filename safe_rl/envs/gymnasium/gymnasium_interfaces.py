@@ -273,7 +273,9 @@ class WorldVectorEnv(Worlds, VectorEnv[Any, np.ndarray, np.ndarray]):
         within = self.autoreset_mode is AutoresetMode.SAME_STEP
         # Environments that start an episode in this step.
         begins = terminated | truncated if within else self._ended
-        reported = _with_masks(_choose(begins, self._first_infos(), infos), np.ones_like(begins))
+        # all rows report: those that begin have the zeros of a reset
+        reported = _with_masks(infos, ~begins)
+        reported |= {f"_{key}": np.ones_like(begins) for key in infos}
         if within:
             reported |= _final_infos(observation, infos, begins)
         else:

@@ -109,7 +109,7 @@ def _faults(model: mujoco.MjModel, options: mujoco.MjsCompiler) -> Iterator[str]
     bodies = [model.body(i) for i in range(1, model.nbody)]
     if all(body.name != "robot" for body in bodies):
         roots = [body.name for body in bodies if body.parentid[0] == 0]
-        yield f"has no body named 'robot': give its root body this name. In the file: {roots}."
+        yield f"has no body named 'robot': rename its root, one of {roots}."
     if outside := [model.geom(i).name for i in range(model.ngeom) if not model.geom_bodyid[i]]:
         yield (
             f"has geoms that belong to no body, {outside}: remove them. The world has a floor, and "
