@@ -58,6 +58,10 @@ _MEANINGS = (
     (r"'env\.name' not found", "env: the file of an environment needs a line 'name: …'."),
     (r"Missing mandatory value: (\S+)", "{0} has to be given: {0}=…"),
     (
+        r"In '(preset)/(\w+)'.*\s+Key '\w+' not in '\w+'\s+full_key: (\S+)",
+        "{}={} sets {}, a key that this environment does not have.",
+    ),
+    (
         r"^'(\w+)/(\S+)' is validated against ConfigStore schema",
         "{}={}: the package has one of this name. Rename your file.",
     ),

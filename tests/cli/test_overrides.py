@@ -33,6 +33,7 @@ WRONG = {
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
+    "transforms=[action_filter]": r"^transforms\.action_filter\.filter\._target_ has to be given:",
     "transforms=[saut]": "no transforms 'saut'. Did you mean 'saute'",
     "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
     "preset=hard_tasks": "^preset=hard_tasks: algo=ppo_lagrangian has no 'memory'. .*algo=sac_lag",
@@ -156,7 +157,7 @@ def test_what_only_other_algorithms_have_is_refused(algo, argument, words):
     ],
 )
 def test_what_a_preset_sets_and_only_other_environments_have_is_refused(preset, algo, key, env):
-    message = rf"^In 'preset/{preset}': .*'{key}' not in '{env}' full_key: env\.{key}"
+    message = rf"^preset={preset} sets env\.{key}, a key that this environment does not have\.$"
     with pytest.raises(ValueError, match=message):
         composed(f"env={env}", f"algo={algo}", f"preset={preset}")
 
