@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import re
@@ -75,8 +76,8 @@ def train(
         hydra: Hydra's settings, for the notes of a new run.
         continues: Whether to continue the run in the folder, or to begin it if there is none.
         callbacks: See `Callback`.
-        program: The command, as the user has called it; None: Python, where the outcome is not
-            printed.
+        program: The command, as the user has called it; None: Python, where the schedule and the
+            outcome are not printed.
 
     Raises:
         SystemExit: If a signal has ended the run; the status is 128 and the signal's number.
@@ -109,6 +110,8 @@ def train(
             stopped_by, length = trainer.stopped_by, trainer.env.max_episode_steps
             if not trainer.is_finished:
                 end_by(stopped_by, f"Interrupted. Continue with: {again()}")
+            del trainer  # the test does not need its replay buffer, which may have gigabytes
+            gc.collect()  # it is part of a cycle
         if is_to_keep_limits(config):
             certify_finished(run, config, length, stopped_by=stopped_by, again=again, say=say)
     return run
@@ -228,7 +231,7 @@ def _prepare(
             keep_robot(run, config.env)
     length = trainer.env.max_episode_steps
     if frames < (first := config.num_envs * length):
-        say(
+        print_line(
             f"No episode will end: {config.num_envs} environments with episodes of {length:,} "
             f"steps end the first ones after {first:,} frames. "
             "Set frames=… or num_envs=…"
@@ -244,12 +247,12 @@ def _announce(algorithm: Algorithm, config: DictConfig, say: Callable[[str], Non
         say(algorithm.schedule)
         planned = OmegaConf.select(config, "limits.frames")
         if planned is not None and whole_frames(config) < planned:
-            say(
+            print_line(
                 f"This schedule was made for {planned:,} frames. If the limits are to fall sooner: "
                 f"limits.frames={config.frames:_}"
             )
     if config.cost_limits and not is_to_keep_limits(config):
-        say(f"algo={config.algo.name} does not keep cost_limits: they are only reported.")
+        print_line(f"algo={config.algo.name} does not keep cost_limits: they are only reported.")
 
 
 def _write_notes(run: Run, config: DictConfig, hydra: Any) -> None:

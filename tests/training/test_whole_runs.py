@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+from weakref import ref
 
 import pytest
 import torch
@@ -82,6 +83,16 @@ def test_a_job_that_dies_before_its_certificate_is_certified_by_the_next_sweep(
     assert Run(tmp_path / "run").certificate["candidates"][-1] == 80
     monkeypatch.setattr(certifying, "certify", lambda *_, **__: pytest.fail("certified twice"))
     run_job(small(), None, Run(tmp_path / "run"))
+
+
+def test_a_run_is_tested_without_the_memory_of_its_training(tmp_path, monkeypatch):
+    trainers, left, run = [], [], Trainer.run
+    monkeypatch.setattr(Trainer, "run", lambda self: trainers.append(ref(self)) or run(self))
+    monkeypatch.setattr(
+        "safe_rl.training.train.certify_run", lambda *_, **__: left.append(trainers[0]())
+    )
+    train(small(), tmp_path / "run")
+    assert left == [None]
 
 
 def test_a_finished_run_is_tested_again_if_other_options_are_given(tmp_path, monkeypatch):
