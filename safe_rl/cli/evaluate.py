@@ -27,6 +27,8 @@ def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] |
     import_modules(modules)
     if options.certify:
         return _certify(directory, options)
+    if options.certificate:
+        raise SettingError("certificate.…: it is the certificate's: add certify=true.")
     print(evaluate(directory, options, progress=True))
     return 0
 

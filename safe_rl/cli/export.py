@@ -65,6 +65,8 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
                 f"The file has the policy without the transforms {names}: your program has to do "
                 "what they do (see its metadata), and a certificate is about both together."
             )
+    elif options.actions is not None:
+        raise SettingError("actions: it is that of FILE.onnx. A FOLDER has the policy itself.")
     else:
         pack_policy(run.directory, target, which)
     print(f"wrote {target}")

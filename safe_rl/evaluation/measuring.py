@@ -177,9 +177,9 @@ def evaluate(
         ValueError: If options exclude or need each other, or ask for a certificate, or the
             environment cannot be drawn.
     """
+    if options.certify or options.certificate:
+        raise ValueError("evaluate: certificates are made by certify(), such as episodes=2000.")
     check_options(options)
-    if options.certify:
-        raise ValueError("evaluate: certificates are made by certify().")
     directory = writable_copy(directory)
     run = Run(directory)
     config = run.config

@@ -107,8 +107,6 @@ def check_options(options: EvaluationOptions) -> None:
     Raises:
         ValueError: If an option needs another one, or excludes it; the message names it.
     """
-    if options.certificate and not options.certify:
-        raise ValueError("certificate.…: it is the certificate's: add certify=true.")
     films = options.video or options.picture
     if not films and options.camera != EvaluationOptions.camera:
         raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")

@@ -111,7 +111,8 @@ class Run:
         if path is None:
             reason = {
                 "last": "it has not saved one yet",
-                "best": "no epoch kept every cost limit, with estimate_<cost> ≤ target_<cost>",
+                "best": "in no epoch did episodes end that kept every cost limit, with "
+                "estimate_<cost> ≤ target_<cost>",
                 "certified": "none of its policies has been certified",
             }
             others = (kind for kind, path in newest.items() if kind != which and path is not None)

@@ -191,6 +191,14 @@ def test_an_evaluation_cannot_be_asked_for_what_there_is_not(run, options, messa
         run.evaluate(**options)
 
 
+def test_what_a_run_will_not_do_is_said(tmp_path, capsys):
+    short = SMALL | {"env.num_steps": 60, "cost_limits": {"cost": 5}}
+    safe_rl.train(algo="ppo", frames=40, directory=tmp_path / "run", **short)
+    printed = capsys.readouterr().out
+    assert "No episode will end" in printed
+    assert "algo=ppo does not keep cost_limits" in printed
+
+
 @pytest.mark.parametrize("choice", [{"env": {"hazards_num": 3}}, {"algo": None}])
 def test_environments_and_algorithms_are_names(choice, tmp_path):
     with pytest.raises(ValueError, match=r"^env and algo are names\. .*store_config.*config_dir"):
@@ -218,8 +226,9 @@ def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
     certificate = run.certify(ranking=2, episodes=4, tests=1)
     assert certificate.options.episodes == 4
     assert "4 episodes never suffice" in str(certificate)
-    with pytest.raises(ValueError, match="made by certify"):
-        run.evaluate(certify=True)
+    for options in ({"certify": True}, {"certificate": {"episodes": 3}}):
+        with pytest.raises(ValueError, match="made by certify"):
+            run.evaluate(**options)
     with pytest.raises(ValueError, match=r"episodes=0: a test needs episodes"):
         run.certify(episodes=0)
 

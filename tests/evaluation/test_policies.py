@@ -83,6 +83,8 @@ def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
 def test_an_option_of_an_export_is_checked(run, tmp_path, capsys):
     assert export([str(run), str(tmp_path / "packed"), "actions=meen"]) == 1
     assert "actions=meen: it must be 'mean' or 'sampled'" in capsys.readouterr().err
+    assert export([str(run), str(tmp_path / "packed"), "actions=mean"]) == 1
+    assert "actions: it is that of FILE.onnx" in capsys.readouterr().err
     assert not (tmp_path / "packed").exists()
 
 
