@@ -62,7 +62,7 @@ class P3OLoss(PPOLoss):
         surrogates = self._cost_surrogates(tensordict, gain)
         return {
             **super()._surrogates(tensordict, log_weight),
-            "loss_penalty": self.kappa * self._known_limits().excess(surrogates).relu().sum(),
+            "loss_penalty": self.kappa * self.limits.excess(surrogates).relu().sum(),
             "cost_surrogate": surrogates.detach(),
         }
 
@@ -125,11 +125,11 @@ class IPOLoss(PPOLoss):
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
         gain = log_weight.exp() * self._cost_advantage(tensordict)
         surrogates = self._cost_surrogates(tensordict, gain)
-        kappa = self.kappa / self._known_limits().length_for(surrogates)
+        kappa = self.kappa / self.limits.length_for(surrogates)
         return {
             **super()._surrogates(tensordict, log_weight),
             "loss_barrier": log_barrier(
-                -self._known_limits().excess(surrogates), kappa, self.max_weight
+                -self.limits.excess(surrogates), kappa, self.max_weight
             ).sum(),
             "cost_surrogate": surrogates.detach(),
         }
@@ -174,7 +174,7 @@ class APPOLoss(WeighsCosts, PPOLoss):
         self.sigma = sigma
 
     def _surrogates(self, tensordict: TensorDictBase, log_weight: Tensor) -> dict[str, Tensor]:
-        state = self._known_limits()
+        state = self.limits
         gain = -clipped_gain(log_weight, -self._cost_advantage(tensordict), self.clip_epsilon)
         scale, unit, length = state.scale.to(gain), state.unit.to(gain), state.length_for(gain)
         surrogates = unit * self._cost_surrogates(tensordict, gain)

@@ -70,8 +70,6 @@ class SurrogateLoss(Checked, SharesTensors):
     target_actor_network_params: TensorDictParams
     entropy_coeff: Tensor
 
-    limits: LimitState | None = None
-
     _behaviour_hint = "It is the behaviour policy's, stored when the action was sampled."
     #: Entries of the batch that a subclass reads besides those of `in_keys`.
     extra_in_keys: tuple[NestedKey, ...] = ()
@@ -84,6 +82,7 @@ class SurrogateLoss(Checked, SharesTensors):
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.multiplier: Multiplier | None = None
+        self._limits: LimitState | None = None
         self.register_coeff_buffer("entropy_coeff", entropy_coeff, device=self._default_device)
         sampler = sampler_of(actor_network)
         kind = getattr(sampler, "distribution_class", None)
@@ -112,16 +111,18 @@ class SurrogateLoss(Checked, SharesTensors):
         so. A loss with costs keeps the state of the limits after this batch.
         """
         if self.has_costs:
-            self.limits = limits
+            self._limits = limits
         return batch
 
-    def _known_limits(self) -> LimitState:
-        if self.limits is None:
+    @property
+    def limits(self) -> LimitState:
+        """State of the limits after the batch; ValueError if `prepare` was called without it."""
+        if self._limits is None:
             raise ValueError(
                 f"{type(self).__name__} needs the state of the limits: call prepare(batch, limits) "
                 "with every batch, before its first step, and what Constraints.update returns."
             )
-        return self.limits
+        return self._limits
 
     @property
     def behaviour_keys(self) -> dict[NestedKey, NestedKey]:
@@ -306,7 +307,7 @@ class WeighsCosts(SurrogateLoss):
 
     def _unit(self, like: Tensor) -> Tensor | float:
         """u, [k], with the dtype and device of a tensor."""
-        return 1.0 if self.limits is None else self.limits.unit.to(like)
+        return 1.0 if self._limits is None else self._limits.unit.to(like)
 
     def _penalised_advantage(self, tensordict: TensorDictBase, log_weight: Tensor) -> Tensor:
         """A − Σᵢ λᵢ A_cᵢ, the advantage of the reward minus the weighted costs, [..., 1]."""

@@ -247,6 +247,8 @@ def test_before_any_batch_the_policy_counts_as_at_its_limit():
     actor, _, batch = one_state(GAIN, COST)
     loss = P3OLoss(actor, kappa=20.0, **FREE)
     with pytest.raises(ValueError, match=r"call prepare\(batch, limits\)"):
+        loss.limits  # noqa: B018  # a loss of the user's reads it
+    with pytest.raises(ValueError, match=r"call prepare\(batch, limits\)"):
         loss(batch)
     told(loss, torch.nan)
     loss.clip_epsilon.fill_(1e6)

@@ -126,7 +126,7 @@ def test_both_optimisers_resume():
 
 def test_the_projection_needs_all_its_inputs_and_no_other_entry():
     _, batch, loss, _ = moved_case()
-    loss.limits = None
+    loss._limits = None
     torch.testing.assert_close(dict(loss(batch.select(*loss.in_keys))), dict(loss(batch)))
     for key in loss.in_keys:
         with pytest.raises(KeyError):
