@@ -52,7 +52,7 @@ class OffPolicy(Resumable, Algorithm):
     steps: int = 0  # environment steps so far
 
     def __post_init__(self) -> None:
-        self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule
+        self.schedule = self.constraints.schedule
         self.cost_networks = [name for name in self.networks if name == "cost_critic"]
         self._choose_exploration()
 
@@ -135,7 +135,7 @@ class OffPolicy(Resumable, Algorithm):
             return ""
         when = "with those of the dataset alone"
         if not len(buffer):
-            when = f"when it holds {self.random_steps:,} new ones"
+            when = f"when it holds {self.random_steps // self.steps_per_decision:,} new ones"
         return (
             "The transitions in its replay buffer are not stored (memory.keep=false): learning "
             f"resumes {when}, and differs from a run that was not interrupted."
@@ -203,8 +203,8 @@ def _check_room(buffer: Memory, random_steps: int, collects: bool) -> None:
         )
     if max(random_steps, size) > buffer.capacity:
         raise ValueError(
-            f"memory.capacity={buffer.capacity}: it must hold "
-            f"exploration.random_steps={random_steps} transitions and {needed}"
+            f"memory.capacity={buffer.capacity}: it must hold {random_steps} transitions, those "
+            f"of exploration.random_steps, and {needed}"
         )
 
 
