@@ -6,7 +6,7 @@ Each class here is a base class. Its optional methods have defaults.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from inspect import isclass
 from typing import Any, Protocol, Self
 
@@ -72,11 +72,10 @@ def networks_of_target(
 class Algorithm(ABC):
     """Interface of algorithms for the training loop, checkpoints, transfer and evaluation.
 
-    A configuration names the class as ``algo._target_``.
+    A configuration names the class as ``algo._target_``, and says ``algo.constrained: false`` if
+    it keeps no limits; other runs are certified.
 
     Attributes:
-        cost_keys: Keys of the constrained costs; empty for an unconstrained algorithm, which says
-            ``algo.constrained: false``, or else its runs are certified.
         policy: Exploring policy, for the collector; it shares the networks' parameters.
         networks: Trained networks, by name. Another run can start from them.
         cost_networks: Names of the networks of the constrained costs. A run starts from another
@@ -86,7 +85,6 @@ class Algorithm(ABC):
         schedule: A sentence on when the limits begin to hold; empty if they do from the start.
     """
 
-    cost_keys: Sequence[str] = ()
     policy: TensorDictModuleBase
     networks: Mapping[str, nn.Module]
     cost_networks: Collection[str] = ()

@@ -52,7 +52,7 @@ class OnPolicy(Algorithm):
     critic_update: PolicyUpdate
 
     def __post_init__(self) -> None:
-        self.cost_keys, self.schedule = self.constraints.keys, self.constraints.schedule
+        self.schedule = self.constraints.schedule
         self.policy = make_behaviour(self.actor)
         self.networks = {"actor": self.actor, "critic": self.critic}
         if self.cost_critic is not None:

@@ -163,9 +163,9 @@ class CheckpointStore:
         self.last.mkdir(parents=True, exist_ok=True)
         self._none_yet.touch()
 
-    def save(self, steps: int, facts: Mapping[str, Any] | None = None) -> Path:
-        """Write a checkpoint with JSON-compatible facts; remove the oldest beyond ``keep_last``."""
-        path = self._write(self.last, steps, facts, states_of(self._components))
+    def save(self, steps: int) -> Path:
+        """Write a checkpoint; remove the oldest beyond ``keep_last``."""
+        path = self._write(self.last, steps, states_of(self._components))
         others = [other for other in checkpoints_in(self.last) if other != path]
         for old in others[: max(0, len(others) + 1 - self._keep_last)]:
             old.unlink()
@@ -174,12 +174,7 @@ class CheckpointStore:
         return path
 
     def save_best(
-        self,
-        steps: int,
-        score: float,
-        facts: Mapping[str, Any] | None = None,
-        *,
-        states: Mapping[str, Any] | None = None,
+        self, steps: int, score: float, *, states: Mapping[str, Any] | None = None
     ) -> bool:
         """Write a checkpoint if fewer than ``keep_best`` exist or ``score`` is above a kept one's.
 
@@ -190,7 +185,7 @@ class CheckpointStore:
         if len(scores) >= self._keep_best and not score > scores[-self._keep_best]:
             return False
         states = states_of(self._components) if states is None else states
-        self._write(self.best, steps, {**(facts or {}), "score": score}, states)
+        self._write(self.best, steps, states, score=score)
         last = checkpoints_in(self.last)
         self._remove_worse(after=last[-1].name if last else "")
         return True
@@ -212,17 +207,13 @@ class CheckpointStore:
             (self.best / checkpoint_name(number)).unlink(missing_ok=True)
 
     def _write(
-        self,
-        directory: Path,
-        steps: int,
-        facts: Mapping[str, Any] | None,
-        states: Mapping[str, Any],
+        self, directory: Path, steps: int, states: Mapping[str, Any], **facts: float
     ) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / checkpoint_name(steps)
         held = {"run": self._run, "interface": self._interface()}
-        facts = {**(facts or {}), **{name: value for name, value in held.items() if value}}
-        save_tensors(path, {"facts": facts, "parts": dict(states)})
+        known = facts | {name: value for name, value in held.items() if value}
+        save_tensors(path, {"facts": known, "parts": dict(states)})
         return path
 
     def resume(self, epochs: int = 0) -> Path | None:

@@ -105,7 +105,4 @@ class CheckpointSelection(Resumable):
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []
-        facts = {"epoch": policy["epoch"]}
-        return [
-            {"steps": policy["steps"], "score": score, "facts": facts, "states": policy["states"]}
-        ]
+        return [{"steps": policy["steps"], "score": score, "states": policy["states"]}]

@@ -249,5 +249,5 @@ class Trainer:
         return before | learned | after
 
     def _save(self) -> None:
-        self._checkpoints.save(self.progress.steps, {"epoch": self.progress.epoch})
+        self._checkpoints.save(self.progress.steps)
         self.writer.draw_curves()

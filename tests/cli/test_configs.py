@@ -70,7 +70,7 @@ def test_every_combination_resolves_and_builds(choices, env):
             find_algorithm(config).from_config(config, PointMass(2))
         return
     algorithm = find_algorithm(config).from_config(config, PointMass(2))
-    assert ("cost_critic" in algorithm.networks) == bool(algorithm.cost_keys)
+    assert ("cost_critic" in algorithm.networks) == bool(algorithm.constraints.keys)
     assert (algorithm.multiplier is not None) == (algo in LAGRANGIAN)
 
 
