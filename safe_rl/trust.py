@@ -212,6 +212,8 @@ def locate(target: Any, key: str = "") -> Callable[..., Any]:
     """  # noqa: E501
     name = " ".join(str(target).split())  # in one line, as messages show it
     shown = f"{key}={name}" if key else name
+    if name == "???":  # OmegaConf's mark of a value that has no default
+        raise TargetError(f"{key} has to be given: {key}=…")
     # the user's modules come first: they may contain a room with fewer names
     root = next((room for room in reversed(_ROOMS) if name.startswith(f"{room}.")), None)
     if root is None:

@@ -64,6 +64,8 @@ def test_a_null_target_is_nothing_and_a_missing_one_an_error():
         instantiate(OmegaConf.create({"loss": {"clip_epsilon": 0.2}}).loss)
     with pytest.raises(TargetError, match=r"^_target_ is missing"):
         instantiate(3)
+    with pytest.raises(TargetError, match=r"^loss\._target_ has to be given: loss\._target_=…$"):
+        instantiate(OmegaConf.create({"loss": {"_target_": "???"}}).loss)
 
 
 def test_an_unknown_argument_of_an_item_of_a_list_is_named():

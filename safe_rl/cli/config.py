@@ -217,9 +217,6 @@ def check_settings(config: DictConfig) -> None:
             if config.algo.get("constrained") is False:  # presets have limits for others
                 config.pop("limits", None)
         _check_parts(config)
-        for key in sorted(OmegaConf.missing_keys(config)):
-            if not key.startswith("hydra."):
-                raise SettingError(f"{key} has to be given: {key}=…")
         _check(General, config, "")
         _check(Algo, config.algo, "algo", is_open=True)
         _check(CertificateOptions, config.certificate, "certificate")

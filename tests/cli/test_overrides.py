@@ -33,7 +33,6 @@ WRONG = {
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
     "env=gymnasium": r"^env\.id has to be given: env\.id=…$",
-    "transforms=[action_filter]": r"^transforms\.action_filter\.filter\._target_ has to be given:",
     "transforms=[saut]": "no transforms 'saut'. Did you mean 'saute'",
     "env.name=PointGoal2": "would train env=PointGoal1 under the name of .*write env=PointGoal2",
     "preset=hard_tasks": "^preset=hard_tasks: algo=ppo_lagrangian has no 'memory'. .*algo=sac_lag",
