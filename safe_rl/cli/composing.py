@@ -31,7 +31,7 @@ from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean, nearest
-from safe_rl.runs.identity import differences, flatten
+from safe_rl.runs.identity import RESUMABLE, differences, flatten
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports
 
@@ -286,7 +286,7 @@ def refuse_changes(directory: Path, config: DictConfig) -> None:
     """Refuse, by a ValueError, a configuration that differs from the run's in a key that stays."""
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     given: Any = OmegaConf.to_container(settings, resolve=True)
-    if changed := differences(Run(directory).settings, given, "may_change"):
+    if changed := differences(Run(directory).settings, given, RESUMABLE):
         key, (before, now) = next(iter(changed.items()))
         raise ValueError(
             f"{key}={now} cannot change in a run that is continued (it was {before}). You may "

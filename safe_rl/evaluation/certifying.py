@@ -123,15 +123,17 @@ def certify(
     replace_json(run.tests_file, noted)  # the error is spent before the first episode of the test
 
     def collect(candidate: int) -> Iterator[dict[str, np.ndarray]]:
-        for _, (episodes,) in _run([evaluations[candidate]], seed, options.episodes, progress):
+        tested = evaluations[candidate]
+        batch = min(options.episodes, _batch_of(tested))
+        for _, (episodes,) in _run([tested], seed, options.episodes, batch, progress):
             yield _costs(episodes)
 
     verdict = first_certified(order, collect, claims, tests, options.episodes)
     certificate = Certificate(None, math.nan, verdict, options, test=number, fewest=fewest)
     if (chosen := verdict.certified) is not None:
         # episodes of the test have decided when it ended: it ends when costs happen to be low
-        batch = _BATCH_OF_WARP if _has_warp(evaluations[chosen]) else _BATCH
-        _, (after,) = next(_run([evaluations[chosen]], seed - _TEST + _AFTER, batch, progress))
+        batch, later = _batch_of(evaluations[chosen]), seed - _TEST + _AFTER
+        _, (after,) = next(_run([evaluations[chosen]], later, batch, batch, progress))
         statements = claims[chosen].statements(_costs(after))
         certificate = replace(
             certificate,
@@ -190,7 +192,8 @@ def _ranked(
     for part, number in enumerate(rounds):
         seed, tried = _RANKING + part * _NEXT_BATCH, order[:left]
         for group in [tried] if together else [[candidate] for candidate in tried]:
-            highest, episodes = next(_run([evaluations[c] for c in group], seed, number, progress))
+            ranked = [evaluations[candidate] for candidate in group]
+            highest, episodes = next(_run(ranked, seed, number, number, progress))
             for candidate, batch in zip(group, episodes, strict=True):
                 episodes_of[candidate].append(batch)
         claim = replace(claim, highest=highest)
@@ -223,10 +226,15 @@ def _has_warp(evaluation: PolicyEvaluation) -> bool:
     return evaluation.node.get("physics") == "warp"
 
 
+def _batch_of(evaluation: PolicyEvaluation) -> int:
+    """Number of episodes that a test runs at a time."""
+    return _BATCH_OF_WARP if _has_warp(evaluation) else _BATCH
+
+
 def _run(
-    evaluations: list[PolicyEvaluation], seed_offset: int, number: int, progress: bool
+    evaluations: list[PolicyEvaluation], seed_offset: int, number: int, batch: int, progress: bool
 ) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
-    """Batches of episodes with seeds that neither training nor another use has, per checkpoint.
+    """`number` episodes in batches, with seeds of no other use, per checkpoint.
 
     A round of the ranking is one batch. In a batch of a test every environment has one episode, so
     short episodes do not count before long ones. Every batch has new instances of the environment:
@@ -237,9 +245,7 @@ def _run(
     """
     evaluation, together = evaluations[0], len(evaluations)
     run_seed, is_fixed = evaluation.seed, has_fixed_layout(evaluation.node)
-    most = _BATCH_OF_WARP if _has_warp(evaluation) else _BATCH
-    batch = number if seed_offset < _TEST else min(number, most)
-    worlds = batch if together > 1 else min(number, most)
+    worlds = batch if together > 1 else min(number, _batch_of(evaluation))
     keys = list(evaluation.config.cost_limits)
     torch.manual_seed(run_seed + seed_offset)
     with ExitStack() as stack, tqdm(total=number, disable=None if progress else True) as bar:

@@ -26,6 +26,7 @@ from safe_rl.reporting.tables import clean, read_certificate, read_code, read_ev
 from safe_rl.runs import run as folders
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.identity import (
+    RESUMABLE,
     changed_settings,
     config_dirs,
     differences,
@@ -201,7 +202,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     names = {run.directory.resolve().relative_to(here).as_posix(): run for run in runs}
     for name in kept.keys() & names:
         # what `resume=` may change makes no other run
-        if changed := differences(kept[name].settings, names[name].settings, "may_change"):
+        if changed := differences(kept[name].settings, names[name].settings, RESUMABLE):
             raise ValueError(
                 f"archive={archive}: its run {name} is another one than that in {root}: they "
                 f"differ in {', '.join(changed)}. Give another folder for these runs."

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -23,24 +23,21 @@ from safe_rl.runs.folder import common_source
 
 
 class Role(Enum):
-    """The purpose of a key.
+    """The purpose of a key."""
 
-    Attributes:
-        names_experiment: Whether runs that differ in it are different experiments.
-        may_change: Whether ``resume=`` may change it.
-        may_differ: Whether a job of a sweep may continue a run that has another value.
-    """
+    EXPERIMENT = "names the experiment: states that are restored with a run depend on it"
+    LEARNING = "names the experiment: a number that may change during a run"
+    LENGTH = "names the experiment: its runs may be made longer"
+    SEED = "distinguishes the runs of an experiment"
+    MANNER = "how a run is carried out: names nothing, and stays"
+    MACHINE = "belongs to the machine"
 
-    EXPERIMENT = ("names the experiment: states that are restored with a run depend on it", 1, 0, 0)
-    LEARNING = ("names the experiment: a number that may change during a run", 1, 1, 0)
-    LENGTH = ("names the experiment: its runs may be made longer", 1, 1, 1)
-    SEED = ("distinguishes the runs of an experiment", 0, 0, 0)
-    MANNER = ("how a run is carried out: names nothing, and stays", 0, 0, 0)
-    MACHINE = ("belongs to the machine", 0, 1, 1)
 
-    def __init__(self, _meaning: str, *flags: int) -> None:
-        self.names_experiment, self.may_change, self.may_differ = map(bool, flags)
-
+OF_EXPERIMENTS = frozenset({Role.EXPERIMENT, Role.LEARNING, Role.LENGTH})
+"""Roles of keys: runs that differ in one of these are different experiments."""
+RESUMABLE = frozenset({Role.LEARNING, Role.LENGTH, Role.MACHINE})
+"""Roles of keys that ``resume=`` may change."""
+_SWEPT = frozenset({Role.LENGTH, Role.MACHINE})
 
 ROLES: dict[str, Role] = {
     "seed": Role.SEED,
@@ -115,7 +112,7 @@ def role_of(key: str) -> Role:
     above = [".".join(names[:depth]) for depth in range(len(names), 0, -1)]
     role = next((ROLES[row] for row in above if row in ROLES), Role.EXPERIMENT)
     # a row ``*.name`` holds only below keys that define the experiment
-    return ROLES.get(f"*.{names[-1]}", role) if role.names_experiment and names[1:] else role
+    return ROLES.get(f"*.{names[-1]}", role) if role in OF_EXPERIMENTS and names[1:] else role
 
 
 def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
@@ -131,17 +128,17 @@ def experiment_of(config: Mapping[str, Any]) -> dict[str, Hashable]:
     return {
         key: common_source(str(value)) if key == "init_from" and value is not None else value
         for key, value in _comparable(config).items()
-        if role_of(key).names_experiment
+        if role_of(key) in OF_EXPERIMENTS
     }
 
 
 def differences(
-    saved: Mapping[str, Any], given: Mapping[str, Any], allowed: str = "may_differ"
+    saved: Mapping[str, Any], given: Mapping[str, Any], allowed: Collection[Role] = _SWEPT
 ) -> dict[str, tuple[Any, Any]]:
     """Dotted key -> saved and given value, of keys that differ although their roles forbid it.
 
-    The attribute `allowed` of `Role` allows a difference: ``may_differ`` for a sweep,
-    ``may_change`` for ``resume=``.
+    Keys of the roles `allowed` may differ: by default those in which a job of a sweep may continue
+    a run that has another value.
 
     Examples:
         >>> differences({"seed": 0, "frames": 10}, {"seed": 1, "frames": 20})
@@ -151,7 +148,7 @@ def differences(
     return {
         key: (both[0].get(key), both[1].get(key))
         for key in sorted({*both[0], *both[1]})
-        if both[0].get(key) != both[1].get(key) and not getattr(role_of(key), allowed)
+        if both[0].get(key) != both[1].get(key) and role_of(key) not in allowed
     }
 
 
@@ -170,7 +167,7 @@ def changed_settings(composed: Any, settings: Mapping[str, Any]) -> dict[str, An
         # values that Hydra computes are not known: nothing of a file is resolved
         if before.get(key, value) != value
         and "${" not in str(before[key])
-        and role_of(key).names_experiment
+        and role_of(key) in OF_EXPERIMENTS
     }
 
 

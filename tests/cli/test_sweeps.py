@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from safe_rl.cli.sweeps import Summary, run_in_sweep, run_job
-from safe_rl.runs.checkpoints import read_facts
+from safe_rl.runs.folder import checkpoint_steps
 from safe_rl.runs.progress_bar import LINE_SECONDS, ProgressBar
 from safe_rl.runs.run import find_runs
 from safe_rl.runs.table import final_figures, read_table
@@ -218,8 +218,7 @@ def test_jobs_have_their_folders_for_themselves_and_end_with_the_sweep(tmp_path)
     wait_until(lambda: not any(map(is_running, processes.values())), 120)
     # they had the time to write what they had come to
     for run in find_runs(tmp_path):
-        epoch = read_facts(run.newest_checkpoint())["epoch"]
-        assert epoch == run.num_rows
+        assert checkpoint_steps(run.newest_checkpoint()) == run.steps
 
 
 @pytest.mark.long

@@ -48,7 +48,7 @@ def test_every_batch_of_a_test_has_new_instances_of_the_environment(monkeypatch)
         lambda state: state.set("action", torch.zeros(len(state), 2))
     )
     costs = torch.stack(
-        [found[0].costs["cost"] for _, found in _run([evaluation], _TEST, 2000, False)]
+        [found[0].costs["cost"] for _, found in _run([evaluation], _TEST, 2000, 100, False)]
     )
     assert costs.shape == (20, 100)
     # of rows that cost 20 in one batch, a tenth does in the next, and not all
@@ -71,7 +71,7 @@ def test_on_a_fixed_layout_the_test_has_other_episodes_than_the_ranking(monkeypa
     monkeypatch.setattr(PolicyEvaluation, "policy", still)
     config = point_mass_config("cost_limits={cost: 19}", "+env.randomize_layout=false")
     evaluation = PolicyEvaluation(config, Path("0"), EvaluationOptions(num_threads=1), make)
-    ranked, tested = (next(_run([evaluation], use, 4, False))[1][0] for use in (_RANKING, _TEST))
+    ranked, tested = (next(_run([evaluation], use, 4, 4, False))[1][0] for use in (_RANKING, _TEST))
     assert (ranked.returns != tested.returns).all()
     torch.testing.assert_close(*layouts)
 
@@ -80,8 +80,9 @@ def test_the_ranking_gives_up_the_worse_half_in_every_round(monkeypatch):
     """Sixteen candidates; the higher their number, the more they cost, all above the limit."""
     used = dict.fromkeys(range(16), 0)
 
-    def run(evaluations, seed, number, progress):
+    def run(evaluations, seed, number, batch, progress):
         (evaluation,) = evaluations
+        assert batch == number
         used[evaluation.number] += number
         costs = 20.0 + evaluation.number + torch.rand(number) / 10
         yield {"cost": 100.0}, [Episodes(costs, costs, {"cost": costs})]
@@ -107,9 +108,9 @@ def test_policies_that_share_a_simulation_get_their_own_episodes(monkeypatch):
     evaluations = [
         PolicyEvaluation(config, Path(action), options, make_env) for action in ("-1", "0", "1")
     ]
-    _, together = next(_run(evaluations, _RANKING, 9, progress=False))
+    _, together = next(_run(evaluations, _RANKING, 9, 9, progress=False))
     for evaluation, found in zip(evaluations, together, strict=True):
-        _, (alone,) = next(_run([evaluation], _RANKING, 9, progress=False))
+        _, (alone,) = next(_run([evaluation], _RANKING, 9, 9, progress=False))
         assert found.costs["cost"].shape == (9,)
         assert found.returns.mean().item() == pytest.approx(alone.returns.mean().item(), rel=0.1)
     assert len({found.returns.mean().round(decimals=1).item() for found in together}) == 3
