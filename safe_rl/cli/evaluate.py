@@ -14,7 +14,7 @@ from safe_rl.trust import check_imports, import_modules
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
     """Run the command; return its exit status."""
-    return run_command(carry_out, arguments, f"{program} RUN_DIR", EvaluationOptions)
+    return run_command(carry_out, arguments, program, ["RUN_DIR"], EvaluationOptions)
 
 
 def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:

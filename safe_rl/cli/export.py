@@ -31,8 +31,7 @@ class ExportOptions(CheckedOptions):
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl export") -> int:
     """Run the command; return its exit status."""
-    places = f"{program} RUN_DIR FILE.onnx|FOLDER"
-    return run_command(export, arguments, places, ExportOptions)
+    return run_command(export, arguments, program, ["RUN_DIR", "FILE.onnx|FOLDER"], ExportOptions)
 
 
 def export(words: list[str], options: ExportOptions, modules: list[str] | None) -> int:

@@ -164,7 +164,8 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
 def run_command(
     work: Callable[[list[str], Any, list[str] | None], int],
     arguments: Sequence[str] | None,
-    command: str,
+    program: str,
+    places: Sequence[str],
     schema: type[DataclassInstance],
 ) -> int:
     """Read the arguments of a command, and run it or print its help; return its exit status.
@@ -175,19 +176,20 @@ def run_command(
         work: Function of the positional arguments, the options, and the modules of ``import=`` or
             None; it returns the exit status.
         arguments: The arguments; None: those of the process.
-        command: The program, followed by its positional arguments in capitals.
+        program: The command's name.
+        places: Names of its positional arguments, as its help shows them.
         schema: Dataclass of its options.
     """
     keep_streams()
     words = sys.argv[1:] if arguments is None else list(arguments)
-    places = sum(word[0].isupper() for word in command.split())
     is_help = words[:1] in (["-h"], ["--help"])
     modules, words = split_imports(words)
-    if is_help or len(words) < places:
-        print(usage(command, schema))
+    if is_help or len(words) < len(places):
+        print(usage(" ".join([program, *places]), schema))
         return 0 if is_help else 2
     try:
-        return work(words[:places], read_options(words[places:], schema), modules)
+        number = len(places)
+        return work(words[:number], read_options(words[number:], schema), modules)
     except _EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -45,7 +45,7 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
 
 def main(arguments: Sequence[str] | None = None, program: str = "safe-rl report") -> int:
     """Run the command; return its exit status."""
-    return run_command(carry_out, arguments, f"{program} RUNS_DIR", ReportOptions)
+    return run_command(carry_out, arguments, program, ["RUNS_DIR"], ReportOptions)
 
 
 def carry_out(words: list[str], options: ReportOptions, modules: list[str] | None) -> int:

@@ -44,8 +44,8 @@ def learning_curves(
     table: Mapping[str, Sequence[float]],
     cost_limits: Mapping[str, float],
     episode_length: int,
-    title: str = "",
-    measure: str = "mean",
+    title: str,
+    measure: str,
 ) -> Figure:
     """Draw return, episode cost and cost rate over environment steps (Ray et al. 2019, Figure 7).
 

@@ -34,7 +34,7 @@ class ProgressBar(tqdm):
         total: int,
         begun: int,
         limits: Mapping[str, float],
-        measure: str = "mean",
+        measure: str,
     ) -> None:
         self._limits, self._measure = limits, measure
         self._seconds, self._printed = float(os.environ.get(LINE_SECONDS, "inf")), monotonic()
@@ -55,9 +55,7 @@ class ProgressBar(tqdm):
             print(self, file=sys.stderr, flush=True)
 
 
-def shown(
-    row: Mapping[str, float], limits: Mapping[str, float], measure: str = "mean"
-) -> dict[str, str]:
+def shown(row: Mapping[str, float], limits: Mapping[str, float], measure: str) -> dict[str, str]:
     """Figures of an epoch for the bar: return, costs with their present limits, multipliers.
 
     Return and costs are means over the episodes that ended in the epoch. While an algorithm lowers
@@ -65,9 +63,10 @@ def shown(
 
     Examples:
         >>> row = {"episode_return": 1.25, "episode_cost": 30.0, "multiplier_cost": 0.5}
-        >>> shown(row, {"cost": 25.0})
+        >>> shown(row, {"cost": 25.0}, "mean")
         {'return': '1.25', 'cost': '30.0/25', 'λ': '0.5'}
-        >>> shown(row | {"estimate_cost": 31.0, "target_cost": 29.0}, {"cost": 25.0})["cost"]
+        >>> row |= {"estimate_cost": 31.0, "target_cost": 29.0}
+        >>> shown(row, {"cost": 25.0}, "mean")["cost"]
         '30.0/target 29'
     """
     if math.isnan(row["episode_return"]):

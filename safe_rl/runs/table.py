@@ -263,18 +263,18 @@ def outcome_line(
     table: Mapping[str, Sequence[float]],
     limits: Mapping[str, float],
     episode_length: int | None,
-    measure: str = "mean",
+    measure: str,
 ) -> str:
     """One line about the end of a run: return and costs over its last epochs.
 
     Examples:
         >>> table = {"steps": [1000, 2000], "time_total": [2.0, 4.0], "cost_rate": [0.03, 0.03]}
         >>> table |= {"episode_return": [1.0, 2.0], "episode_cost": [30.0, 20.0]}
-        >>> outcome_line(table, {"cost": 25.0}, 1000)
+        >>> outcome_line(table, {"cost": 25.0}, 1000, "mean")
         'Return 1.50, cost 25.0 (limit 25) per episode, mean of steps 1 to 2,000; 500 steps/s'
-        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, 1000)
+        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, 1000, "mean")
         'No episode of 1,000 steps has ended; 500 steps/s'
-        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, None)
+        >>> outcome_line(table | {"episode_return": [math.nan] * 2}, {"cost": 25.0}, None, "mean")
         'No episode has ended; 500 steps/s'
     """
     keys = list(limits) or ["cost"]

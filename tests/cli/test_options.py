@@ -115,5 +115,5 @@ def test_an_error_cannot_control_the_terminal(capsys):
     def fail(*arguments):
         raise ValueError("a robot named \x1b]0;mine\x07")
 
-    assert run_command(fail, ["run"], "safe-rl evaluate RUN", EvaluationOptions) == 1
+    assert run_command(fail, ["run"], "safe-rl evaluate", ["RUN"], EvaluationOptions) == 1
     assert capsys.readouterr().err == "error: a robot named ?]0;mine?\n"

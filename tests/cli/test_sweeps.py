@@ -104,7 +104,7 @@ def test_runs_that_share_a_terminal_print_lines(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(LINE_SECONDS, "0")
     row = {"steps": 250, "steps_per_second": 5000.0, "episode_return": 1.5, "episode_cost": 30.0}
-    bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0})
+    bar = ProgressBar(tmp_path / "seed0", 1000, 0, {"cost": 25.0}, "mean")
     bar.add({**row, "multiplier_cost": 0.5})
     bar.close()
     (line,) = capsys.readouterr().err.splitlines()

@@ -20,12 +20,13 @@ TABLE = {
 
 def drawn(cost_limits, table=TABLE):
     """The panels of a picture."""
-    return learning_curves(table, cost_limits, 1000, "title").axes
+    return learning_curves(table, cost_limits, 1000, "title", "mean").axes
 
 
 def test_a_picture_replaces_the_one_before(tmp_path):
     for limits in ({"cost": 25.0}, {}):
-        path = save_figure(learning_curves(TABLE, limits, 1000, "title"), tmp_path / "curves.png")
+        figure = learning_curves(TABLE, limits, 1000, "title", "mean")
+        path = save_figure(figure, tmp_path / "curves.png")
         assert imread(path).std() > 0
         assert list(tmp_path.iterdir()) == [path]
 
