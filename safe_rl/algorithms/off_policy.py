@@ -72,7 +72,7 @@ class OffPolicy(Resumable, Algorithm):
             multiplier.to(device)
         cost_values = instantiate(config.critics.get("cost_values"))
         read = config.model.get("critic_observes")
-        networks = build_networks(config, env, len(limits), device, cost_values, read)
+        networks = _build_networks(config, env, len(limits), device, cost_values, read)
         loss = instantiate(
             config.loss,
             {
@@ -124,7 +124,7 @@ class OffPolicy(Resumable, Algorithm):
         cls, config: DictConfig, env: EnvBase, device: torch.device
     ) -> tuple[TensorDictModuleBase, Mapping[str, nn.Module]]:
         """Build the policy for evaluation, without exploration noise."""
-        actor = build_networks(config, env, 0, device)["actor"]
+        actor = _build_networks(config, env, 0, device)["actor"]
         return exploring_policy(actor, env, 0.0), {"actor": actor}
 
     @property
@@ -214,7 +214,7 @@ def exploring_policy(actor: TensorDictModuleBase, env: EnvBase, noise: float) ->
     return ExploringPolicy(actor, spec.low, spec.high, noise=noise)
 
 
-def build_networks(
+def _build_networks(
     config: DictConfig,
     env: EnvBase,
     num_costs: int,

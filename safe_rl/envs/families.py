@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 
 from safe_rl.checks import Text
 from safe_rl.envs.foreign import FOREIGN, complete_foreign
-from safe_rl.envs.keys import ConfigError, Count, Key, checked, structured
+from safe_rl.envs.keys import ConfigError, Count, Key, check_key, structured
 from safe_rl.envs.safety_gym.config import KEYS, SafetyGymConfig
 from safe_rl.envs.safety_gym.suite import EXTRAS, SUITE, resolve
 from safe_rl.envs.velocity.velocity_config import (
@@ -209,7 +209,7 @@ def make_env(
     from safe_rl.envs.safety_gym.env import SafetyGymEnv
     from safe_rl.envs.transforms import transform_env
 
-    count = checked("num_envs", Count, num_envs)
+    count = check_key("num_envs", Count, num_envs)
     given = {"num_envs": count, "device": device, "seed": seed, "num_threads": num_threads}
     node = dict(env if isinstance(env, Mapping) else env_node(env))
     node |= keys

@@ -16,7 +16,7 @@ from annotated_types import Interval
 from pydantic import AllowInfNan, ValidationError
 
 from safe_rl.checks import Text
-from safe_rl.envs.keys import ConfigError, Count, Key, adapter, as_plain, checked, is_cost
+from safe_rl.envs.keys import ConfigError, Count, Key, adapter, as_plain, check_key, is_cost
 from safe_rl.naming import did_you_mean
 
 _RANGES = (
@@ -117,7 +117,7 @@ def complete_foreign(family: ForeignFamily, node: Mapping[str, Any]) -> dict[str
         )
     full = {"name": node["id"], **node}
     for key, row in family.keys.items():
-        checked(key, row.annotation, full.setdefault(key, row.default))
+        check_key(key, row.annotation, full.setdefault(key, row.default))
     parse_ranges(full.get("outside"))
     if None in (full["cost_keys"], full["num_steps"]):
         full["cost_keys"], full["num_steps"] = resolve_name(family.describe)(full)

@@ -52,7 +52,7 @@ class Key(NamedTuple):
 adapter = cache(checks.adapter)
 
 
-def checked(name: str, annotation: Any, value: Any) -> Any:
+def check_key(name: str, annotation: Any, value: Any) -> Any:
     """Return a value with the type of its key; ConfigError if the type or range is wrong."""
     check = adapter(annotation)
     try:

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from safe_rl.envs import rng
 from safe_rl.envs.contract import ConstrainedEnv
-from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, checked
+from safe_rl.envs.keys import ConfigError, Count, Seed, Threads, check_key
 from safe_rl.envs.physics import OUTPUTS, BatchPhysics, Physics
 from safe_rl.envs.physics.dynamics import SCALES, DrawnDynamics
 from safe_rl.envs.pictures import chosen_rows
@@ -59,8 +59,8 @@ class SimulatedEnv(ConstrainedEnv):
     _observer: Any
 
     def __init__(self, num_envs: int, device: torch.device | str, num_threads: int) -> None:
-        num_envs = checked("num_envs", Count, num_envs)
-        checked("num_threads", Threads, num_threads)
+        num_envs = check_key("num_envs", Count, num_envs)
+        check_key("num_threads", Threads, num_threads)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self._physics_settings: tuple[Any, ...] = (num_threads,)
 
@@ -136,7 +136,7 @@ class SimulatedEnv(ConstrainedEnv):
 
     def _set_seed(self, seed: int | None, rows: slice = slice(None)) -> None:
         if seed is not None:
-            seed = checked("seed", Seed, seed)
+            seed = check_key("seed", Seed, seed)
             number = len(self._episode[rows])
             self._row_seed[rows] = rng.row_seeds(seed, number, self._physics.device)
             self._episode[rows] = 0

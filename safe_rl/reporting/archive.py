@@ -39,7 +39,7 @@ RUNS, ROWS = "runs.json.gz", "rows.csv.gz"
 _MOST_BYTES = 200_000_000  # of either file when it is unpacked
 
 
-class Run(folders.Run):
+class ReportedRun(folders.Run):
     """A run of a report; ``notes`` are ``overrides``, ``certificate`` … as in its files.
 
     Attributes:
@@ -99,7 +99,7 @@ class Run(folders.Run):
         return repeating(self.overrides, folders, {clean(k): v for k, v in (changed or {}).items()})
 
 
-def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[Path, str]]:
+def read_runs(root: Path, *, unfinished: bool = False) -> tuple[list[ReportedRun], dict[Path, str]]:
     """Runs below a folder that have finished an epoch, also of archives; and what is left out.
 
     The latter is folder or file -> reason. With ``unfinished`` all runs count as finished.
@@ -109,7 +109,7 @@ def find_runs(root: Path, *, unfinished: bool = False) -> tuple[list[Run], dict[
     """
     if not root.is_dir():
         raise FileNotFoundError(f"There is no folder '{root}': give the folder of the runs.")
-    candidates: list[Run] = []
+    candidates: list[ReportedRun] = []
     skipped: dict[Path, str] = {}
     for path in paths_below(root, RUNS):
         with _noted(path, skipped):
@@ -151,7 +151,7 @@ def _noted(path: Path, skipped: dict[Path, str]) -> Iterator[None]:
         skipped[path] = clean(reason)
 
 
-def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
+def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> ReportedRun:
     """Read a run from its folder; notes that cannot be read are left out."""
 
     def read(path: Path, check: Callable[[Any], object] = bool) -> Any:
@@ -184,10 +184,10 @@ def _read_run(folder: folders.Run, skipped: dict[Path, str]) -> Run:
         or None,
     }
     kept = {name: value for name, value in notes.items() if value is not None}
-    return Run(folder.directory, settings=settings, table=table, notes=kept)
+    return ReportedRun(folder.directory, settings=settings, table=table, notes=kept)
 
 
-def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
+def archive_runs(runs: Iterable[ReportedRun], root: Path, archive: Path) -> None:
     """Add runs to an archive, or update them there; their names are their paths below ``root``.
 
     Raises:
@@ -216,7 +216,7 @@ def archive_runs(runs: Iterable[Run], root: Path, archive: Path) -> None:
     _write_archive(dict(sorted((kept | names).items())), archive)
 
 
-def _write_archive(runs: Mapping[str, Run], folder: Path) -> None:
+def _write_archive(runs: Mapping[str, ReportedRun], folder: Path) -> None:
     """Write runs, by name, as an archive; equal runs give equal bytes."""
     pandas = import_extra("pandas", "report")
     folder.mkdir(parents=True, exist_ok=True)
@@ -234,7 +234,7 @@ def _write_archive(runs: Mapping[str, Run], folder: Path) -> None:
             unfinished.write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
-def read_archive(folder: Path | str) -> dict[str, Run]:
+def read_archive(folder: Path | str) -> dict[str, ReportedRun]:
     """Read the runs of an archive, by name, without checking them.
 
     Raises:
@@ -247,7 +247,7 @@ def read_archive(folder: Path | str) -> dict[str, Run]:
         runs = {}
         for name, notes in entries.items():
             contents = {"settings": notes.pop("config"), "table": tables.get(name, {})}
-            runs[name] = Run(folder / name, **contents, notes=notes)
+            runs[name] = ReportedRun(folder / name, **contents, notes=notes)
         return runs
     except Exception as error:  # the files may hold anything
         raise ValueError(f"{folder.name} is no archive ({error})") from error

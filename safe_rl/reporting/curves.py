@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from safe_rl.reporting.archive import Run
+from safe_rl.reporting.archive import ReportedRun
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.figures import (
     LIMIT_STYLE,
@@ -52,7 +52,7 @@ class Average(NamedTuple):
     high: np.ndarray
 
 
-def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None:
+def average(runs: Sequence[ReportedRun], column: str, *, smooth: bool) -> Average | None:
     """Average a column of the runs' tables over seeds; None without runs, or if one has no value.
 
     The curve ends with the shortest run. Between epochs, and where no episode finished, values are
@@ -75,7 +75,7 @@ def average(runs: Sequence[Run], column: str, *, smooth: bool) -> Average | None
     return Average(grid, heights.mean(-1), *t_interval(heights))
 
 
-def _curves(runs: Sequence[Run], key: str) -> list[Average | None]:
+def _curves(runs: Sequence[ReportedRun], key: str) -> list[Average | None]:
     """Return, episode cost and cost rate; None in place of those without a value."""
     columns = [("episode_return", True), (f"episode_{key}", True), (f"{key}_rate", False)]
     return [average(runs, name, smooth=s) for name, s in columns]
@@ -104,7 +104,7 @@ def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
     ]
 
 
-def learning_curves(
+def curves_of_experiments(
     experiments: Sequence[Experiment], styles: Mapping[str, Style], width: float
 ) -> list[Drawing]:
     """Draw return, episode cost and cost rate over steps, a row per environment and steps of runs.

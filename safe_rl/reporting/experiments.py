@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from safe_rl.files import CONF
-from safe_rl.reporting.archive import Run
+from safe_rl.reporting.archive import ReportedRun
 from safe_rl.reporting.tables import clean, short_number
 from safe_rl.runs.identity import Role, experiment_of, flatten, role_of
 from safe_rl.scores.benchmark import ALGORITHMS, COST_LIMIT, REFERENCE, Suite
@@ -39,7 +39,7 @@ class Experiment:
     title: str
     settings: Settings
     benchmark: str | None
-    runs: tuple[Run, ...]
+    runs: tuple[ReportedRun, ...]
 
     def name_without(self, *groups: str) -> str:
         """Name of the algorithm, with its settings except those of some groups."""
@@ -95,7 +95,7 @@ class Experiment:
         return is_known and self.is_published_problem and bool(self.finished)
 
     @property
-    def finished(self) -> tuple[Run, ...]:
+    def finished(self) -> tuple[ReportedRun, ...]:
         """Its finished runs."""
         return tuple(run for run in self.runs if run.is_finished)
 
@@ -117,7 +117,7 @@ def cost_keys_of(experiments: Sequence[Experiment]) -> list[str]:
 
 
 def group_runs(
-    runs: Sequence[Run], suite: Suite, labels: Mapping[str, str] = {}
+    runs: Sequence[ReportedRun], suite: Suite, labels: Mapping[str, str] = {}
 ) -> tuple[list[Experiment], dict[Path, str]]:
     """Group runs into experiments, in the order of the benchmark and of the paper's tables.
 
@@ -158,7 +158,7 @@ def _order(experiment: Experiment) -> tuple[Hashable, ...]:
     return *environment, places.get(experiment.base, 99), experiment.algorithm
 
 
-def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
+def _environment_names(runs: Sequence[ReportedRun], suite: Suite) -> dict[Path, str]:
     """Folder -> name of the environment, with the keys that differ from the suite's.
 
     Names of other environments have the keys in which environments of that name differ.
@@ -179,7 +179,7 @@ def _environment_names(runs: Sequence[Run], suite: Suite) -> dict[Path, str]:
 
 
 def _settings_of_names(
-    runs: Sequence[Run], environments: Mapping[Path, str]
+    runs: Sequence[ReportedRun], environments: Mapping[Path, str]
 ) -> dict[Path, Settings]:
     """Folder -> the settings in the name of its run.
 
@@ -188,7 +188,7 @@ def _settings_of_names(
     default, all settings that differ are used there.
     """
     named: dict[Path, Settings] = {}
-    by_algorithm: dict[str, dict[str, list[Run]]] = defaultdict(lambda: defaultdict(list))
+    by_algorithm: dict[str, dict[str, list[ReportedRun]]] = defaultdict(lambda: defaultdict(list))
     for run in runs:
         by_algorithm[run.algorithm][environments[run.directory]].append(run)
     for cells in by_algorithm.values():
@@ -198,7 +198,7 @@ def _settings_of_names(
         by_cell = [[settings[run.directory] for run in cell] for cell in cells.values()]
         keys = distinguishing_keys([*by_cell, anywhere])
         for cell in cells.values():
-            alike: dict[tuple[tuple[str, Hashable], ...], list[Run]] = defaultdict(list)
+            alike: dict[tuple[tuple[str, Hashable], ...], list[ReportedRun]] = defaultdict(list)
             for run in cell:
                 of_run = settings[run.directory]
                 known = tuple((key, of_run[key]) for key in keys if of_run.get(key) is not None)
@@ -213,7 +213,7 @@ def _settings_of_names(
     return named
 
 
-def _is_given(key: str, run: Run) -> bool:
+def _is_given(key: str, run: ReportedRun) -> bool:
     """Whether a user has set a key, or chosen the group that it belongs to.
 
     In a run with YAML files of the user's, any key may have been set there.
@@ -239,7 +239,7 @@ def title_of(algorithm: str) -> str:
     return ALGORITHMS.get(algorithm) or "-".join(written)
 
 
-def _settings(run: Run) -> dict[str, Hashable]:
+def _settings(run: ReportedRun) -> dict[str, Hashable]:
     """The settings that may distinguish a run's algorithm from others of the same name."""
     settings = experiment_of(run.settings)
     # some keys only repeat the length of the run

@@ -20,8 +20,8 @@ from safe_rl.checks import CheckedOptions, option, rule
 from safe_rl.extras import import_extra
 from safe_rl.files import replace_text
 from safe_rl.reporting import run_tables, scoring
-from safe_rl.reporting.archive import Run, find_runs
-from safe_rl.reporting.curves import benchmark_figures, curve_rows, learning_curves
+from safe_rl.reporting.archive import ReportedRun, read_runs
+from safe_rl.reporting.curves import benchmark_figures, curve_rows, curves_of_experiments
 from safe_rl.reporting.experiments import Experiment, group_runs
 from safe_rl.reporting.figures import WIDTH, Drawing, algorithm_styles, fronts
 from safe_rl.reporting.tables import Table, clean
@@ -77,7 +77,7 @@ class Report:
     skipped: Mapping[Path, str]
 
     @property
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[ReportedRun]:
         """All runs of the report, without baselines."""
         runs = [run for experiment in self.experiments for run in experiment.runs]
         return [run for run in runs if not run.source]
@@ -110,7 +110,7 @@ def build_report(root: Path, suite: Suite, options: ReportOptions) -> Report:
     slates = scoring.complete_slates(experiments, options.seeds)
     reasons = [{"what": clean(path), "why": clean(why, 500)} for path, why in skipped.items()]
     left_out = Table("left_out", "Left out", {"what": "{what}", "why": "{why}"}, reasons)
-    curves = learning_curves(experiments, styles, width)
+    curves = curves_of_experiments(experiments, styles, width)
     blocks: dict[str, list[Any]] = {
         "final": finals,
         "curves": [*benchmark_figures(experiments, width), *curves],
@@ -132,13 +132,13 @@ def _name_among(place: Path, others: Collection[Path]) -> str:
     return str(Path(*next(alone, place.parts)))
 
 
-def _find_all(root: Path, options: ReportOptions) -> tuple[list[Run], dict[Path, str]]:
+def _find_all(root: Path, options: ReportOptions) -> tuple[list[ReportedRun], dict[Path, str]]:
     """The runs below a folder and finished ones of baselines; and what is left out."""
-    runs, skipped = find_runs(root, unfinished=options.unfinished)
+    runs, skipped = read_runs(root, unfinished=options.unfinished)
     own = {run.environment for run in runs}
     places = [Path(place).expanduser().resolve() for place in listed(options.baselines)]
     for place in places:
-        found, missed = find_runs(place)
+        found, missed = read_runs(place)
         added = [run for run in found if run.environment in own and run.is_finished]
         for run in added:
             run.source = clean(_name_among(place, places), 80)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from math import inf, nan
 from typing import Any
 
-from safe_rl.reporting.archive import Run
+from safe_rl.reporting.archive import ReportedRun
 from safe_rl.reporting.experiments import Experiment
 from safe_rl.reporting.tables import (
     Record,
@@ -23,7 +23,7 @@ from safe_rl.scores.bounds import rounded_up
 _WHERE = {"environment": "{environment}", "algorithm": "{algorithm}", "seed": "{seed:d}"}
 
 
-def _each_run(experiments: Sequence[Experiment]) -> Iterator[tuple[dict[str, Any], Run]]:
+def _each_run(experiments: Sequence[Experiment]) -> Iterator[tuple[dict[str, Any], ReportedRun]]:
     for e in experiments:
         place = {"environment": e.environment, "algorithm": e.algorithm}
         yield from (({**place, "seed": run.seed}, run) for run in e.runs)

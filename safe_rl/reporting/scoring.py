@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_rl.reporting.archive import Run
+from safe_rl.reporting.archive import ReportedRun
 from safe_rl.reporting.experiments import Experiment, cost_keys_of
 from safe_rl.reporting.tables import Record, Table, each_cost, interval, mark_best, spread
 from safe_rl.runs.table import final_rows
@@ -51,7 +51,7 @@ def final_record(experiment: Experiment, cost_keys: Sequence[str]) -> dict[str, 
     return record
 
 
-def _critic_bias(run: Run) -> dict[str, float]:
+def _critic_bias(run: ReportedRun) -> dict[str, float]:
     """Mean bias of every cost critic over the last epochs; positive if it predicts too much."""
     names = [name for name in run.table if name.startswith("critic_bias_")]
     known = {name: np.array(run.table[name])[final_rows(run.table)] for name in names}

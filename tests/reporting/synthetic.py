@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from safe_rl.cli.report import suite
-from safe_rl.reporting.archive import find_runs
+from safe_rl.reporting.archive import read_runs
 from safe_rl.reporting.experiments import group_runs
 
 COLUMNS = [
@@ -33,7 +33,7 @@ EVALUATION = {
 
 def grouped(root: Path):
     """Experiments below a folder, and what was left out for being a repetition."""
-    runs, _ = find_runs(root)
+    runs, _ = read_runs(root)
     return group_runs(runs, SUITE)
 
 

@@ -9,7 +9,7 @@ import yaml
 from synthetic import EVALUATION, write_run
 
 from safe_rl.cli.report import main
-from safe_rl.reporting.archive import ROWS, RUNS, archive_runs, find_runs, read_archive
+from safe_rl.reporting.archive import ROWS, RUNS, archive_runs, read_archive, read_runs
 
 EPOCHS = {
     "returns": (0.1 + 0.2, 1e300, 2.5),
@@ -35,7 +35,7 @@ def runs(tmp_path):
 
 
 def keep(root, archive):
-    archive_runs(find_runs(root)[0], root, archive)
+    archive_runs(read_runs(root)[0], root, archive)
 
 
 def contents(folder):
@@ -67,7 +67,7 @@ def test_an_archive_follows_runs_that_go_on_and_is_the_same_bytes_otherwise(runs
     with (run / "config.yaml").open("a") as file:  # `resume=` may change it
         file.write("lagrangian: {kp: 0.5}\n")
     # one of them alone: the others stay
-    archive_runs([r for r in find_runs(runs)[0] if r.directory == run], runs, kept)
+    archive_runs([r for r in read_runs(runs)[0] if r.directory == run], runs, kept)
     again = read_archive(kept)
     assert len(again) == 4
     assert again["PointGoal1/ppo/seed0"].table["steps"][-1] == 4000
@@ -107,13 +107,13 @@ def test_nothing_says_where_the_runs_were_but_their_commands(runs, tmp_path):
 
 
 def test_an_archive_that_is_written_half_way_has_the_runs_that_it_had(runs, tmp_path, monkeypatch):
-    kept, (first, *others) = tmp_path / "kept", find_runs(runs)[0]
+    kept, (first, *others) = tmp_path / "kept", read_runs(runs)[0]
     archive_runs([first], runs, kept)
     once = iter([pack])
     monkeypatch.setattr(gzip, "compress", lambda text, mtime: next(once)(text))
     with pytest.raises(StopIteration):
         archive_runs(others, runs, kept)
-    found, skipped = find_runs(kept)
+    found, skipped = read_runs(kept)
     assert len(found) == 1
     assert not skipped
 
@@ -122,7 +122,7 @@ def test_a_run_may_have_a_name_that_pandas_takes_for_a_missing_number(tmp_path):
     no_episode = {"returns": ("",), "costs": ("",)}  # has ended in this run
     root = write_run(tmp_path, folder="null", limits={"cost_a": 1}, **no_episode).parent
     keep(root, tmp_path / "kept")
-    assert [run.steps for run in find_runs(tmp_path / "kept")[0]] == [1000]
+    assert [run.steps for run in read_runs(tmp_path / "kept")[0]] == [1000]
 
 
 def test_an_archive_is_not_among_the_runs_and_keeps_others_of_their_names(runs, tmp_path, capsys):
@@ -141,7 +141,7 @@ def test_a_run_that_began_again_does_not_replace_the_longer_one(runs, tmp_path):
     lines = (run / "progress.csv").read_text().splitlines(keepends=True)
     (run / "progress.csv").write_text("".join(lines[:3]))
     with pytest.raises(ValueError, match=r"ppo/seed0 has 3,000 steps.* only 2,000"):
-        archive_runs(find_runs(runs)[0], runs, kept)
+        archive_runs(read_runs(runs)[0], runs, kept)
     assert read_archive(kept)["PointGoal1/ppo/seed0"].steps == 3000
 
 
@@ -159,7 +159,7 @@ def test_a_damaged_archive_is_left_out_with_its_reason(name, content, message, r
     keep(runs, tmp_path / "all" / "kept")
     (tmp_path / "all" / "kept" / name).write_bytes(content)
     write_run(tmp_path / "all", **EPOCHS)
-    found, skipped = find_runs(tmp_path / "all")
+    found, skipped = read_runs(tmp_path / "all")
     assert len(found) == 1
     assert message in skipped[tmp_path / "all" / "kept" / RUNS]
 
@@ -170,6 +170,6 @@ def test_a_run_of_an_archive_that_cannot_be_read_is_left_out_alone(runs, tmp_pat
     text = gzip.decompress((kept / RUNS).read_bytes())
     text = text.replace(b'"certificate": {', b'"certificate": {"level": "a"}, "x": {', 1)
     (kept / RUNS).write_bytes(gzip.compress(text))
-    found, skipped = find_runs(kept)
+    found, skipped = read_runs(kept)
     assert len(found) == 3
     assert "KeyError('checkpoint')" in skipped[kept / "PointGoal1" / "cpo" / "seed0"]

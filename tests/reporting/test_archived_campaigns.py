@@ -8,7 +8,7 @@ import pytest
 from commands import ROOT
 
 from safe_rl.reporting.archive import RUNS as FILE
-from safe_rl.reporting.archive import find_runs, read_archive
+from safe_rl.reporting.archive import read_archive, read_runs
 
 RESULTS = ROOT / "results"
 PAGE = (RESULTS / "README.md").read_text()
@@ -29,7 +29,7 @@ def archives():
 
 
 def test_every_run_can_be_reported_and_every_campaign_is_listed():
-    runs, skipped = find_runs(RESULTS)
+    runs, skipped = read_runs(RESULTS)
     assert not skipped
     assert all(run.repeating for run in runs)
     assert all(r.is_finished for r in runs if not STOPPED & {*r.directory.parts})

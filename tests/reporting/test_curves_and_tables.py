@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import experiments_in, write_run
 
-from safe_rl.reporting.archive import find_runs
+from safe_rl.reporting.archive import read_runs
 from safe_rl.reporting.curves import average
 from safe_rl.reporting.scoring import final_record
 from safe_rl.reporting.tables import Table, spread
@@ -17,7 +17,7 @@ def test_curves_are_means_over_seeds_on_common_steps(tmp_path):
     fast = {"returns": [10.0, 12.0], "costs": [1, 1], "rates": [0.3, 0.6]}
     write_run(tmp_path, seed=0, **slow, frames=0)
     write_run(tmp_path, seed=1, **fast, frames=0)
-    runs, _ = find_runs(tmp_path)
+    runs, _ = read_runs(tmp_path)
     curve = average(runs, "cost_rate", smooth=False)
     # until the shorter one ends, with as many points as the longer one has epochs
     np.testing.assert_allclose(curve.steps, [1000, 1500, 2000])
@@ -36,7 +36,7 @@ def test_a_curve_begins_where_all_of_its_runs_have_and_bridges_epochs_without_an
     nan, alike = float("nan"), {"costs": [1, 1, 1, 1, 1], "rates": [0.1] * 5}
     write_run(tmp_path, seed=0, returns=[0.0, 2.0, 4.0, nan, 8.0], **alike)
     write_run(tmp_path, seed=1, returns=[nan, nan, 14.0, 16.0, 18.0], **alike)
-    curve = average(find_runs(tmp_path)[0], "episode_return", smooth=False)
+    curve = average(read_runs(tmp_path)[0], "episode_return", smooth=False)
     # what comes before is of one seed alone, and no mean over seeds
     np.testing.assert_allclose(curve.steps[[0, -1]], [3000, 5000])
     np.testing.assert_allclose(curve.mean, 9.0 + (curve.steps - 3000) / 500)

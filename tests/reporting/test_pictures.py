@@ -6,7 +6,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from synthetic import experiments_in, write_run
 
-from safe_rl.reporting.curves import benchmark_figures, learning_curves
+from safe_rl.reporting.curves import benchmark_figures, curves_of_experiments
 from safe_rl.reporting.experiments import PACKAGED
 from safe_rl.reporting.figures import add_legend, algorithm_styles, fronts
 from safe_rl.reporting.scoring import final_table
@@ -16,7 +16,7 @@ ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
 
 
 def learning_pictures(experiments):
-    drawings = learning_curves(experiments, algorithm_styles(experiments), 12.0)
+    drawings = curves_of_experiments(experiments, algorithm_styles(experiments), 12.0)
     return [drawing.figure for drawing in drawings]
 
 

@@ -7,7 +7,7 @@ import yaml
 from synthetic import grouped, write_run
 
 from safe_rl.files import CONF
-from safe_rl.reporting.archive import find_runs
+from safe_rl.reporting.archive import read_runs
 from safe_rl.reporting.experiments import distinguishing_keys, title_of
 
 
@@ -44,12 +44,12 @@ def test_a_run_knows_its_command_and_its_end(tmp_path):
     write_run(tmp_path, seed=1, frames=9000)
     (tmp_path / "PointGoal1/ppo/seed1/.hydra/overrides.yaml").unlink()
     write_run(tmp_path, seed=2, overrides=[])
-    first, second, third = find_runs(tmp_path)[0]
+    first, second, third = read_runs(tmp_path)[0]
     assert first.repeating == "python train.py env=PointGoal1 'cost_limits={cost: 10}' seed=0"
     assert (first.steps, first.is_finished, first.hours) == (2000, True, 0.002)
     assert (second.repeating, third.repeating) == (None, "python train.py")
     assert not second.is_finished
-    assert find_runs(tmp_path, unfinished=True)[0][1].is_finished
+    assert read_runs(tmp_path, unfinished=True)[0][1].is_finished
 
 
 def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
@@ -64,14 +64,14 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
     # it was continued to 1000, and with other sizes
     config = yaml.safe_load((run / "config.yaml").read_text()) | {"model": {"sizes": [16]}}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
-    (found,), _ = find_runs(tmp_path)
+    (found,), _ = read_runs(tmp_path)
     assert found.repeating == (
         "python train.py '--config-dir=/home/me/my conf' env=PointGoal1 seed=0 frames=1000 "
         "'model.sizes=[16]'"
     )
     (run / ".hydra/config.yaml").write_text("frames: ${paper.frames.point}")
     (run / ".hydra/hydra.yaml").unlink()
-    assert find_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
+    assert read_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
 def test_names_have_what_a_file_of_the_users_or_resuming_has_changed(tmp_path):
@@ -112,7 +112,7 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
     (empty / "progress.csv").write_text("epoch,steps\n")
     (torn / "progress.csv").write_text("epoch,steps\n1,1000\n2\n")
     (garbled / "config.yaml").write_text("{")
-    runs, skipped = find_runs(tmp_path)
+    runs, skipped = read_runs(tmp_path)
     assert [run.directory for run in runs] == [good]
     reasons = {path.name: reason for path, reason in skipped.items()}
     assert len(reasons) == 6
@@ -126,12 +126,12 @@ def test_what_is_no_run_is_named_with_its_reason(tmp_path):
 
 def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
     with pytest.raises(FileNotFoundError, match="a run is a folder with config"):
-        find_runs(tmp_path)
+        read_runs(tmp_path)
     (write_run(tmp_path) / "progress.csv").unlink()
     with pytest.raises(FileNotFoundError, match=r"seed0: no progress\.csv: it is no run"):
-        find_runs(tmp_path)
+        read_runs(tmp_path)
     with pytest.raises(FileNotFoundError, match="There is no folder"):
-        find_runs(tmp_path / "elsewhere")
+        read_runs(tmp_path / "elsewhere")
 
 
 def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):

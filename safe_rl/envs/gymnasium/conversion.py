@@ -19,7 +19,7 @@ from safe_rl.envs.gymnasium.gymnasium_env import (
     GymnasiumEnv,
     make_adapted,
 )
-from safe_rl.envs.keys import ConfigError, Count, checked, found_costs
+from safe_rl.envs.keys import ConfigError, Count, check_key, found_costs
 from safe_rl.envs.rng import spread_seed
 from safe_rl.envs.torchrl.step_entries import dotted
 from safe_rl.naming import did_you_mean
@@ -83,9 +83,9 @@ def from_gymnasium(
         >>> env.rollout(3)["next", "cost_hazards"].shape
         torch.Size([2, 3, 1])
     """
-    checked("num_envs", Count, num_envs)
+    check_key("num_envs", Count, num_envs)
     if num_steps is not None:
-        checked("num_steps", Count, num_steps)
+        check_key("num_steps", Count, num_steps)
     if isinstance(cost_keys, str):
         raise ConfigError(f"'cost_keys' must be a list of names, such as ['{cost_keys}'].")
     if not (isinstance(env, str) or callable(env)):

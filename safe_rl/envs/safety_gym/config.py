@@ -10,7 +10,7 @@ from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from safe_rl.envs.keys import ConfigError, Key, checked
+from safe_rl.envs.keys import ConfigError, Key, check_key
 from safe_rl.envs.safety_gym.config_keys import Keys
 from safe_rl.naming import did_you_mean
 
@@ -55,7 +55,7 @@ class SafetyGymConfig(Keys):
                 "SafetyGymConfig lists every key with its default."
             )
         for name, row in KEYS.items():
-            vars(self)[name] = checked(name, row.annotation, values.get(name, row.default))
+            vars(self)[name] = check_key(name, row.annotation, values.get(name, row.default))
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise FrozenInstanceError(f"A configuration cannot change: use replace({name}=…).")
@@ -107,5 +107,5 @@ def register_keys(keys: Mapping[str, Key]) -> None:
     for name, row in keys.items():
         if name in _BUILT_IN:
             raise ConfigError(f"The configuration key '{name}' is taken: choose another name.")
-        checked(name, row.annotation, row.default)
+        check_key(name, row.annotation, row.default)
     KEYS.update(keys)

@@ -25,7 +25,7 @@ from safe_rl.envs.keys import (
     NotNegative,
     Number,
     Positive,
-    checked,
+    check_key,
 )
 from safe_rl.naming import did_you_mean
 
@@ -169,7 +169,7 @@ class VelocityConfig:
                     raise ConfigError(f"Robot '{self.robot}' has no key '{row.name}'.")
                 continue
             value = defaults.get(row.name) if value is None else value
-            vars(self)[row.name] = checked(row.name, ANNOTATIONS[row.name], value)
+            vars(self)[row.name] = check_key(row.name, ANNOTATIONS[row.name], value)
 
     @classmethod
     def from_dict(cls, keys: Mapping[str, Any]) -> VelocityConfig:
