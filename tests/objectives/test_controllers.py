@@ -107,7 +107,7 @@ def test_costs_are_controlled_separately():
 def test_the_controller_of_fsrl_is_translated():
     """The page's words give the multiplier of `LagrangianOptimizer` (fsrl/utils/optim_util.py)."""
     page = (ROOT / "docs/coming_from/fsrl.md").read_text()
-    words = re.search(r"`--lagrangian_pid 0\.05 0\.0005 0\.1` \| `(.*?)`", page)[1].split()
+    words = re.search(r"`--lagrangian_pid '\[0\.05,0\.0005,0\.1\]'` \| `(.*?)`", page)[1].split()
     settings = {k: v for k, v in compose_config(*words).lagrangian.items() if k != "_target_"}
     costs, expected, old, integral = [30.0, 60.0, 20.0, 45.0], [], 0.0, 0.0
     for error in (cost - 25.0 for cost in costs):
