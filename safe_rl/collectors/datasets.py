@@ -257,13 +257,18 @@ def _arrays(place: Path | str, nodes: Mapping[str, Any], names: Mapping[NestedKe
     if missing := sorted(set(names.values()) - {"costs"} - set(present)):
         raise ValueError(
             f"{place} has no {', '.join(missing)}: transitions are read from files like those of "
-            f"DSRL or Minari. What it has: {printable(', '.join(present)) or 'nothing'}."
+            f"DSRL or Minari. What it has: {printable(_listed(present)) or 'nothing'}."
         )
     arrays = {key: _values(place, nodes[name]) for key, name in names.items() if name in present}
     for key in _FLAGS:
         if not np.isin(arrays[key], (0, 1)).all():
             raise ValueError(f"{place}: its {names[key]} must be 0 or 1.")
     return arrays | {key: arrays[key].astype(bool) for key in _FLAGS}
+
+
+def _listed(names: list[str]) -> str:
+    """Names for a message, the first ten only: d3rlpy's files have several arrays per episode."""
+    return ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
 
 
 def _check_shapes(place: Path | str, arrays: Arrays) -> Arrays:

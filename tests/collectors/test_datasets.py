@@ -207,6 +207,16 @@ def test_what_is_no_dataset_is_refused(tmp_path, h5py):
         read_dataset(tmp_path / "nothing")
 
 
+def test_a_file_with_arrays_per_episode_is_refused_in_a_short_line(tmp_path, h5py):
+    """d3rlpy 2 writes `observations_0`, `actions_0`, …, thousands of names."""
+    with h5py.File(tmp_path / "d3rlpy.h5", "w") as file:
+        for i in range(1000):
+            file[f"actions_{i}"] = np.zeros((3, 2))
+    with pytest.raises(ValueError, match=r"has no actions.*actions_0,.* and 990 more\.$") as caught:
+        read_hdf5(tmp_path / "d3rlpy.h5")
+    assert len(str(caught.value)) < 500
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
