@@ -79,8 +79,9 @@ def _read(path: Path, *, lazy: bool = False) -> dict[str, dict[str, Any]]:
         return path.content
     try:
         content = load_tensors(path, lazy=lazy)
-        if not all(isinstance(content[name], dict) for name in ("facts", "parts")):
-            raise ValueError("it has no facts, or no parts")
+        known = content if isinstance(content, dict) else {}
+        if not all(isinstance(known.get(name), dict) for name in ("facts", "parts")):
+            raise ValueError("no run of safe_rl wrote it")
         content["facts"] = all_printable(content["facts"])
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CheckpointError(f"Cannot use the checkpoint {path}: {error}.") from error

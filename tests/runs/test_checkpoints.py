@@ -121,6 +121,13 @@ def test_loading_runs_no_code_of_the_file(tmp_path):
     assert (tmp_path / "trace.txt").exists()  # it is harmful indeed
 
 
+@pytest.mark.parametrize("content", [{"pi": {"weight": torch.ones(2)}}, torch.ones(2), {}])
+def test_a_file_of_other_software_is_refused_in_plain_words(content, tmp_path):
+    """OmniSafe, for example, stores the parts of its actor."""
+    torch.save(content, tmp_path / "epoch-2.pt")
+    refuse(tmp_path / "epoch-2.pt", r"epoch-2\.pt: no run of safe_rl wrote it\.$")
+
+
 def test_what_is_compressed_is_refused_before_it_fills_the_memory(tmp_path):
     path = CheckpointStore(tmp_path, {"counter": Counter(1)}, keep_last=1).save(10)
     with (
