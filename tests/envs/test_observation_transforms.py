@@ -95,11 +95,12 @@ def test_noise_comes_from_the_seed_and_rows_do_not_share_it(env):
 
 def test_costs_and_their_traces_are_observed():
     priced = Priced([[1.0, 0.0, 4.0, 0.0]])
-    env = transformed(priced, seen=ObservedCosts(0.5, ["cost"]), evaluating=True)
+    env = transformed(priced, seen=ObservedCosts(0.75, ["cost"]), evaluating=True)
     check_env_specs(env)
     assert env.observation_layout["last_costs"] == slice(4, 5)
     env.set_seed(0)
     seen = still(env, 6)["next", "observation"][0, :, 4:]
-    assert seen.tolist() == [[1, 0.5], [0, 0.25], [4, 2.125], [0, 1.0625], [1, 0.5], [0, 0.25]]
+    traces = [0.25, 0.1875, 1.140625, 0.85546875, 0.25, 0.1875]
+    assert seen.tolist() == [[c, e] for c, e in zip((1, 0, 4, 0, 1, 0), traces, strict=True)]
     everything = TransformedEnv(priced, ObservedCosts(0.5))  # TorchRL's class does not name them
     assert everything.reset()["observation"].shape == (1, 4 + 2 * len(priced.cost_keys))

@@ -6,7 +6,7 @@ from samples import make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
-from safe_rl.objectives.advantages import CostGAE, VectorGAE
+from safe_rl.objectives.advantages import CostGAE, JointAdvantages, VectorGAE
 from safe_rl.objectives.gae import normalise_advantages
 
 N, T = 4, 37  # of rollouts
@@ -153,16 +153,22 @@ def test_value_estimate_gives_the_targets_and_leaves_the_rollout():
     critic = make_critic()
     rollout = make_rollout([])
     estimator = VectorGAE(critic, gamma=0.95, lmbda=0.9, value_target="lambda_return")
-    before = set(rollout.keys(True, True))
+    before = rollout.clone()
     found = estimator.value_estimate(rollout)
-    assert set(rollout.keys(True, True)) == before
+    assert (rollout == before).all()  # other keys raise an error
     theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(rollout.clone())
     torch.testing.assert_close(found, theirs["value_target"], atol=1e-5, rtol=1e-5)
     zero = torch.zeros_like(rollout["next", "reward"])
-    greedy = VectorGAE(critic, gamma=0.95, lmbda=0.0, value_target="lambda_return")
-    torch.testing.assert_close(
-        greedy.value_estimate(rollout, next_value=zero), rollout["next", "reward"]
-    )
+    for gamma, lmbda in ((0.95, 0.0), (0.0, 0.9)):
+        greedy = VectorGAE(critic, gamma=gamma, lmbda=lmbda, value_target="lambda_return")
+        found = greedy.value_estimate(rollout, next_value=zero)
+        torch.testing.assert_close(found, rollout["next", "reward"])
+    other = make_critic()
+    found = estimator(rollout.clone(), params=TensorDict.from_module(other))
+    theirs = GAE(gamma=0.95, lmbda=0.9, value_network=other)(rollout.clone())
+    torch.testing.assert_close(found["advantage"], theirs["advantage"], atol=1e-5, rtol=1e-5)
+    with pytest.raises(ValueError, match="target_params needs two passes"):
+        estimator(rollout, target_params=TensorDict.from_module(other))
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -176,9 +182,26 @@ def test_time_is_the_dimension_of_that_name(named):
     rollout = VectorGAE(critic, **settings)(rollout.clone())
     theirs = GAE(gamma=0.95, lmbda=0.9, value_network=critic)(turned.clone(), **words)
     estimator = VectorGAE(critic, **settings)
-    targets = estimator.value_estimate(turned, **words)
+    later = torch.randn(N, T, 1)
+    targets = estimator.value_estimate(turned, next_value=later.transpose(0, 1), **words)
+    expected = estimator.value_estimate(rollout, next_value=later)
+    torch.testing.assert_close(targets, expected.transpose(0, 1))
     found = estimator(turned, **words)
-    torch.testing.assert_close(found["value_target"], targets)
     for key in ("advantage", "value_target", "state_value"):
         torch.testing.assert_close(found[key], rollout[key].transpose(0, 1))
     torch.testing.assert_close(found["advantage"], theirs["advantage"], atol=1e-5, rtol=1e-5)
+
+
+def test_both_advantages_come_from_one_call_under_keys_of_ones_own():
+    settings = {"gamma": 0.95, "lmbda": 0.9, "value_target": "lambda_return"}
+    parts = VectorGAE(make_critic(), **settings), CostGAE(["cost"], make_critic("c"), **settings)
+    parts[1].set_keys(value="c")
+    rollout = make_rollout([])
+    turned = rollout.transpose(0, 1).contiguous()
+    expected = normalise_advantages(parts[1](parts[0](rollout)))
+    both = JointAdvantages(*parts)
+    both.set_keys(advantage="a")
+    parts[1].set_keys(advantage="b")
+    found = both(turned, time_dim=0)
+    for key, own in (("advantage", "a"), ("cost_advantage", "b")):
+        torch.testing.assert_close(found[own], expected[key].transpose(0, 1))
