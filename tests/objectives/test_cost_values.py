@@ -44,7 +44,7 @@ def make_steps(observations, following, costs, terminated):
     )
 
 
-@pytest.mark.parametrize("tail", [0.01, 0.1, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("tail", [0.01, 0.1, 0.5, 0.9, 1.0])
 def test_the_tail_is_the_mean_beyond_the_quantile(tail):
     beyond = stats.norm.isf(tail)
     mean = integrate.quad(lambda x: x * stats.norm.pdf(x), beyond, np.inf)[0] / tail
@@ -144,12 +144,23 @@ def test_means_bootstrap_on_the_larger_of_two_and_never_on_less_than_can_be(lowe
     numbers = torch.tensor([[5.0, 6.0, 1.0, 1.0], [1.0, 3.0, 1.0, 1.0]]).view(2, 4, 1, 1)
     found, following = (loss.cost_values.arranged(each, 1) for each in numbers)
     step = torch.tensor([[6.0]]), torch.tensor([[0.5]])
-    errors = loss.cost_values.errors(found, *step, following, loss.bounded)
+    errors = loss.cost_values.errors(found.requires_grad_(), *step, following, loss.bounded)
     variance, target = np.log1p(np.e), 6.0 + 0.5 * later
+    # the target of the variance, which has the mean in it, does not move the mean
+    (slope,) = torch.autograd.grad(errors.sum(), found)
+    assert slope[0].flatten().tolist() == pytest.approx([2 * (m - target) for m in (5.0, 6.0)])
+    deviation = loss.cost_values.figures(found)["cost_deviation"]
+    torch.testing.assert_close(deviation, torch.full((2, 1, 1), variance**0.5))
     for mean, error in zip((5.0, 6.0), errors.flatten().tolist(), strict=True):
         wanted = target**2 + 0.25 * variance - mean**2
         distance = (mean - target) ** 2 + (np.sqrt(variance) - np.sqrt(wanted)) ** 2
         assert error == pytest.approx(distance, rel=1e-5)
+
+
+def test_a_variance_that_vanishes_has_a_finite_slope():
+    numbers = torch.tensor([[3.0], [-200.0]], requires_grad=True)
+    GaussianCosts(tail=0.5).cost(numbers).sum().backward()
+    assert numbers.grad.tolist() == [[1.0], [0.0]]
 
 
 def quantiles(number=10, tail=1.0, huber=1e-3):
@@ -167,8 +178,10 @@ def test_quantiles_of_every_cost_and_critic_come_from_one_network():
     ("tail", "expected"), [(1.0, 2.5), (0.5, 3.5), (0.25, 4.0), (0.375, 11 / 3)]
 )
 def test_the_tail_is_the_mean_of_the_highest_quantiles(tail, expected):
-    found = quantiles(4, tail).cost(torch.tensor([3.0, 1.0, 4.0, 2.0]).unsqueeze(-1))
-    torch.testing.assert_close(found, torch.tensor([expected]))
+    values, numbers = quantiles(4, tail), torch.tensor([3.0, 1.0, 4.0, 2.0]).unsqueeze(-1)
+    torch.testing.assert_close(values.cost(numbers), torch.tensor([expected]))
+    deviation = values.figures(numbers)["cost_deviation"]
+    torch.testing.assert_close(deviation, torch.tensor([1.25**0.5]))
 
 
 def test_the_quantile_loss_is_the_equation_of_its_article():

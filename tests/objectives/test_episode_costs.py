@@ -89,7 +89,9 @@ def test_the_length_counts_steps_of_batches_without_ends_and_the_last_hundred_en
         one_row.update(10, torch.full((ends,), 25.0))
     for steps, ends in [(50, 10)] * 20 + [(100, 50)] * 2:
         changed.update(steps, torch.full((ends,), steps / ends))
-    assert (one_row.mean, changed.mean) == (25, 2)
+    cut_off = EpisodeLengths(100)
+    cut_off.update(500, torch.tensor([40.0]))  # the other rows have not ended yet
+    assert (one_row.mean, changed.mean, cut_off.mean) == (25, 2, 100)
 
 
 @pytest.mark.parametrize(("rows", "steps"), [(30, 200), (4, 1000), (7, 130)])
@@ -130,6 +132,8 @@ def test_shrinkage_predicts_a_wandering_cost_better_than_the_batch_and_than_the_
         squared["mean of all"] += (total / number - truth).square().item()
     assert squared["shrunk"] < 0.6 * min(squared["batch"], squared["mean of all"])
     assert estimate.error.square().item() == pytest.approx(squared["shrunk"] / 4000, rel=0.15)
+    exact = (CostEstimate(torch.tensor([cost]), torch.zeros(1)) for cost in (5.0, 7.0))
+    assert shrink(*exact, torch.zeros(1)).mean == 7
 
 
 def heaps(generator: torch.Generator, per_step: float = 0.001, size: float = 25.0):
@@ -158,5 +162,6 @@ def test_the_unit_of_a_cost_is_1_for_indicators_and_grows_with_the_cost():
     costs = (torch.rand(4, 50, 1) < 0.2).float() * torch.tensor([1.0, 7.0])
     estimator = EpisodeCosts(2, max_length=50, drift=0.1, decay=0.9)
     assert estimator.unit.tolist() == [1.0, 1.0]
-    estimator.update(costs, torch.empty(0))
+    for given in (costs, 0 * costs):
+        estimator.update(given, torch.empty(0))
     assert estimator.unit.tolist() == [1.0, 7.0]
