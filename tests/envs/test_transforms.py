@@ -135,8 +135,9 @@ def test_the_budget_of_simmer_grows_from_episode_to_episode():
     begins = still(env, 24)["observation"][0, ::4, -1]
     assert begins.tolist() == pytest.approx([0.25, 0.4375, 0.625, 0.8125, 1.0, 1.0])
     again = transformed(Priced([[0.5] * 4]), "simmer")
-    again.continue_from(8)
-    assert again.reset()["observation"][0, -1].item() == pytest.approx(0.625)
+    for steps, share in ((8, 0.625), (12, 0.8125)):  # before the first reset, and after it
+        again.continue_from(steps)
+        assert again.reset()["observation"][0, -1].item() == pytest.approx(share)
     solved = transformed(Priced([[0.5] * 4]), "simmer", evaluating=True)
     assert solved.reset()["observation"][0, -1].item() == 1.0
 

@@ -87,10 +87,11 @@ def test_limits_are_held_against_the_mean_of_the_epochs():
 
 @pytest.mark.parametrize(
     ("estimate", "target", "is_kept"),
-    [(24.0, 22.0, False), (24.0, 30.0, True), (28.0, 30.0, False)],
+    [(24.0, 22.0, False), (25.0, 30.0, True), (28.0, 30.0, False)],
 )
 def test_an_estimate_has_to_be_at_its_target_and_within_the_limit(estimate, target, is_kept):
-    row = {"episode_cost": 20.0, "estimate_cost": estimate, "target_cost": target}
+    # with costs exactly at the limit
+    row = {"episode_cost": 25.0, "estimate_cost": estimate, "target_cost": target}
     assert keeps(row, "cost", 25.0) is is_kept
 
 
