@@ -29,8 +29,8 @@ def epochs_until_scored(over: int, length: float, steps_per_epoch: float) -> int
         >>> epochs_until_scored(over=3, length=1000, steps_per_epoch=200)
         4
     """
-    lag = length / steps_per_epoch / 2 if length > steps_per_epoch else 0.0
-    return 1 + min(_LONGEST, int(lag) + over // 2)
+    lag = int(length / steps_per_epoch / 2)
+    return 1 + min(_LONGEST, lag + over // 2)
 
 
 class CheckpointSelection(Resumable):
