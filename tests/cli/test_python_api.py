@@ -20,7 +20,7 @@ from run_configs import CONF, without_times
 import safe_rl
 from safe_rl.cli.composing import compose_run, overrides_of
 from safe_rl.envs import ConfigError
-from safe_rl.reporting.archive import archive_runs, find_runs
+from safe_rl.reporting.archive import archive_runs, read_runs
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
@@ -79,9 +79,9 @@ def test_the_report_has_the_command_of_a_run_from_python(tmp_path):
         cost_limits={"cost": 10}, **SMALL,
     )  # fmt: skip
     safe_rl.resume(tmp_path / "runs" / "a", frames=80)
-    archive_runs(find_runs(tmp_path / "runs")[0], tmp_path / "runs", tmp_path / "kept")
+    archive_runs(read_runs(tmp_path / "runs")[0], tmp_path / "runs", tmp_path / "kept")
     for root in ("runs", "kept"):
-        (found,), skipped = find_runs(tmp_path / root)
+        (found,), skipped = read_runs(tmp_path / root)
         assert not skipped
         begin, *words = found.repeating.split(" env=PointGoal1 algo=cpo ")
         assert begin.startswith("python train.py --config-dir=")

@@ -137,7 +137,6 @@ def test_the_folder_of_a_run(tmp_path):
     assert facts.pop("interface")["actions"]["low"] == [-1.0, -1.0]
     # the last policy is judged by the last three epochs
     assert facts == {
-        "epoch": 4,
         "score": pytest.approx(fmean(table["episode_return"][1:])),
         "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
