@@ -234,7 +234,7 @@ def _batch_of(evaluation: PolicyEvaluation) -> int:
 def _run(
     evaluations: list[PolicyEvaluation], seed_offset: int, number: int, batch: int, progress: bool
 ) -> Iterator[tuple[dict[str, float], list[Episodes]]]:
-    """`number` episodes in batches, with seeds of no other use, per checkpoint.
+    """`number` episodes per checkpoint, `batch` at a time, with seeds that nothing else uses.
 
     A round of the ranking is one batch. In a batch of a test every environment has one episode, so
     short episodes do not count before long ones. Every batch has new instances of the environment:

@@ -178,7 +178,7 @@ def evaluate(
             environment cannot be drawn.
     """
     if options.certify or options.certificate:
-        raise ValueError("evaluate: certificates are made by certify(), such as episodes=2000.")
+        raise ValueError("evaluate: a certificate is made by certify(episodes=2000).")
     check_options(options)
     directory = writable_copy(directory)
     run = Run(directory)

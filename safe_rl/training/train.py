@@ -247,7 +247,7 @@ def _announce(algorithm: Algorithm, config: DictConfig, say: Callable[[str], Non
         say(algorithm.schedule)
         planned = OmegaConf.select(config, "limits.frames")
         if planned is not None and whole_frames(config) < planned:
-            print_line(
+            say(
                 f"This schedule was made for {planned:,} frames. If the limits are to fall sooner: "
                 f"limits.frames={config.frames:_}"
             )
