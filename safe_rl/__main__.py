@@ -11,6 +11,7 @@ from safe_rl.naming import did_you_mean
 COMMANDS = {
     "train": "train an algorithm on an environment, as python train.py does",
     "evaluate": "measure a trained policy on whole episodes",
+    "certify": "test which checkpoint of a run keeps the limits",
     "export": "write a trained policy as ONNX, or as a small folder",
     "report": "summarise a folder of runs on one page",
 }

@@ -84,7 +84,7 @@ def _choose_actions(run: Run, checkpoint: Path, asked: str | None) -> bool:
         print(
             f"WARNING: this policy is certified with {certified} actions. The file has its {asked} "
             "actions, which the certificate does not cover, and so the file has no certificate. To "
-            "certify the policy with mean actions: safe-rl evaluate RUN_DIR certify=true "
+            "certify the policy with mean actions: safe-rl certify RUN_DIR "
             "deterministic=true",
             file=sys.stderr,
         )

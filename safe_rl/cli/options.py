@@ -1,4 +1,4 @@
-"""Options of the commands ``evaluate``, ``export`` and ``report``, and how these commands run.
+"""Options of the commands but ``train``, and how these commands run.
 
 Options are written ``key=value`` in Hydra's grammar, as in training. They are the fields of a
 dataclass: pydantic checks them by their annotations, and their help texts make the command's help.

@@ -174,11 +174,9 @@ def evaluate(
         OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If options exclude or need each other, or ask for a certificate, or the
-            environment cannot be drawn.
+        ValueError: If options exclude or need each other, or the environment cannot
+            be drawn.
     """
-    if options.certify or options.certificate:
-        raise ValueError("evaluate: a certificate is made by certify(episodes=2000).")
     check_options(options)
     directory = writable_copy(directory)
     run = Run(directory)

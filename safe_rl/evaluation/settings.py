@@ -29,6 +29,7 @@ PICTURES = ("gif", "webp")
 _PICTURE = rule(
     lambda v: Path(v).suffix[1:] in PICTURES, f"a file ending in .{' or .'.join(PICTURES)}"
 )
+_Threads = Annotated[int, Interval(ge=0, le=1024)]
 _NAME = rule(lambda v: "/" not in v and v.isprintable(), "a part of files' names, without /")
 
 
@@ -48,9 +49,7 @@ class EvaluationOptions(CheckedOptions):
     num_envs: Annotated[int, Interval(ge=1, le=100_000)] = option(
         25, "environments that are stepped together"
     )
-    num_threads: Annotated[int, Interval(ge=0, le=1024)] = option(
-        0, "threads that step them; 0: one per core"
-    )
+    num_threads: _Threads = option(0, "threads that step them; 0: one per core")
     device: Device = option("cpu", "where the policy acts: cpu or cuda")
     cvar_alpha: Fraction = option(0.1, "share of the costliest episodes in the CVaR")
     video: bool = option(False, "write an MP4 of an episode from the first layout (extra 'video')")
@@ -59,10 +58,6 @@ class EvaluationOptions(CheckedOptions):
     )
     camera: str = option("free", "of the video: free, fixednear, fixedfar, track or vision")
     record: bool = option(False, "write every transition to disk, for dataset.path=…")
-    certify: bool = option(False, "find and certify the best checkpoint that keeps the limits")
-    certificate: dict[str, Any] = option(
-        dict, "with certify=true: certificate.episodes=2000, as in training"
-    )
     cost_limits: dict[str, NonNegativeFloat] = option(
         dict, "limits to use instead of the run's own, such as '{cost: 10}'"
     )
@@ -72,6 +67,17 @@ class EvaluationOptions(CheckedOptions):
     env: dict[str, Any] = option(
         dict, "keys of the environment, as in training: env.hazards_num=12"
     )
+
+
+@dataclass
+class CertifyOptions(CheckedOptions):
+    """Options of ``safe-rl certify``; the help texts say what they mean."""
+
+    certificate: dict[str, Any] = option(
+        dict, "certificate.episodes=2000 and so on, as in training; else the run's own"
+    )
+    deterministic: bool = option(False, "certify the policy's mean actions; else sampled ones")
+    num_threads: _Threads = option(0, "threads that step environments; 0: one per core")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -304,7 +304,7 @@ def certify_finished(
         )
     if reason is not None:
         given = "" if is_unchanged else f" certificate.episodes={config.certificate.episodes}"
-        command = f"safe-rl evaluate {quote(str(run.directory))} certify=true{given}"
+        command = f"safe-rl certify {quote(str(run.directory))}{given}"
         say(f"Not certified: {reason}: {command}{import_words(config)}")
         return
     later = f"Interrupted before it was certified. To do so: {again()}"

@@ -11,7 +11,7 @@ import termios
 import pytest
 from commands import ROOT, SMALL
 
-from safe_rl.cli import evaluate
+from safe_rl.cli import certify
 from safe_rl.runs.table import read_table
 
 pytestmark = pytest.mark.long
@@ -58,12 +58,12 @@ def test_a_run_that_ignores_the_signal_is_certified(tmp_path):
 
 
 def test_closed_streams_and_narrow_encodings_end_no_run(tmp_path, monkeypatch):
-    """A closed standard error ended tqdm, and ASCII an evaluation after it was done."""
+    """A closed standard error ended tqdm, and ASCII a certificate after it was done."""
     words = [sys.executable, "train.py", *SMALL, "frames=80", f"hydra.run.dir={tmp_path / 'run'}"]
     subprocess.run(["sh", "-c", '"$@" 2>&-', "sh", *words], cwd=ROOT, check=True)
     assert len(read_table(tmp_path / "run" / "progress.csv")["steps"]) == 2
-    changes = ["certify=true", "certificate.episodes=2", "certificate.ranking=2"]
+    changes = ["certificate.episodes=2", "certificate.ranking=2"]
     ascii_only = io.TextIOWrapper(written := io.BytesIO(), encoding="ascii", write_through=True)
     monkeypatch.setattr(sys, "stdout", ascii_only)
-    assert evaluate.main([str(tmp_path / "run"), *changes]) == 0
+    assert certify.main([str(tmp_path / "run"), *changes]) == 0
     assert b"mean_cost \\u2264" in written.getvalue()

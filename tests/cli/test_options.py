@@ -78,11 +78,10 @@ def test_options_that_need_others_are_refused_before_anything_is_done(tmp_path):
 
 def test_keywords_may_be_numbers_of_numpy_and_paths():
     given = {"episodes": np.int64(3), "checkpoint": Path("a/b"), "env": {"x": np.array([1.5, 2])}}
-    options = make_options(
-        given | {"certificate": {"m": {"k": (np.float32(0.5), 1)}}}, EvaluationOptions
-    )
+    options = make_options(given, EvaluationOptions)
     assert (options.episodes, options.checkpoint, options.env) == (3, "a/b", {"x": [1.5, 2.0]})
-    assert options.certificate == {"m": {"k": [0.5, 1]}}
+    nested = {"env": {"m": {"k": (np.float32(0.5), 1)}}}
+    assert make_options(nested, EvaluationOptions).env == {"m": {"k": [0.5, 1]}}
     for keys in ({"env.hazards_num": 3}, {"env": {"hazards_num": 3}}):
         assert make_options(keys, EvaluationOptions).env == {"hazards_num": 3}
 

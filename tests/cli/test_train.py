@@ -78,7 +78,7 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
     assert len(said) == lines
     for line in said:
         assert "frames=40 are fewer than 12,000, a fifth of the steps of certificate.ep" in line
-        assert line.endswith(f"safe-rl evaluate {Path('runs/short').resolve()} certify=true")
+        assert line.endswith(f"safe-rl certify {Path('runs/short').resolve()}")
     assert not Path("runs/short/certificate.json").exists()
 
 

@@ -20,7 +20,7 @@ from safe_rl.cli.export import ExportOptions
 from safe_rl.cli.options import read_options
 from safe_rl.cli.report import ReportOptions
 from safe_rl.evaluation import EvaluationOptions
-from safe_rl.evaluation.settings import check_options
+from safe_rl.evaluation.settings import CertifyOptions, check_options
 
 PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md")))]
 # snippets that have tests of their own, with more to say
@@ -30,6 +30,7 @@ LACKING = ("comes with the extra", "cannot be imported in this Python", "if torc
 # options of our other commands, and what else stands after the folder
 SCHEMAS: dict[str, list] = {
     "evaluate": [EvaluationOptions],
+    "certify": [CertifyOptions],
     "export": [ExportOptions, "FILE"],
     "report": [ReportOptions],
 }

@@ -21,8 +21,6 @@ from safe_rl.evaluation.loading import override_env
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "ending in .gif or .webp"),
         (["picture=nowhere/there.gif"], "there is no folder nowhere"),
-        (["certify=true", "env.hazards_num=3"], "env: it is ignored by certify=true"),
-        (["certificate.episodes=9"], "add certify=true"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):
