@@ -222,13 +222,10 @@ def test_a_run_is_measured_against_other_limits(run):
     assert own.estimates["episode_cost"] == none.estimates["episode_cost"]
 
 
-def test_a_run_is_certified_and_what_is_no_evaluation_refused(run):
+def test_a_run_is_certified_and_without_episodes_refused(run):
     certificate = run.certify(ranking=2, episodes=4, tests=1)
     assert certificate.options.episodes == 4
     assert "4 episodes never suffice" in str(certificate)
-    for options in ({"certify": True}, {"certificate": {"episodes": 3}}):
-        with pytest.raises(ValueError, match="made by certify"):
-            run.evaluate(**options)
     with pytest.raises(ValueError, match=r"episodes=0: a test needs episodes"):
         run.certify(episodes=0)
 
