@@ -91,12 +91,12 @@ def curve_rows(experiments: Sequence[Experiment]) -> list[dict[str, Any]]:
     """All curves of the pictures as a long table: a row for every point of every quantity."""
     return [
         {
-            **{"environment": e.environment, "algorithm": e.algorithm, "cost": key},
+            **{"environment": e.environment, "algorithm": algorithm, "cost": key},
             **{"quantity": name, "seeds": len(runs)},
             **dict(zip(Average._fields, map(float, point), strict=True)),
         }
         for e in experiments
-        for runs in [e.finished or e.runs]
+        for runs, algorithm in [(e.finished or e.runs, e.algorithm)]
         for key in _drawn_keys([e])
         for name, curve in zip(("return", "cost", "rate"), _curves(runs, key), strict=True)
         if curve is not None
