@@ -62,6 +62,14 @@ def test_transitions_come_back_as_they_went_in():
         assert "goal_met" not in step["next"].keys()  # noqa: SIM118
 
 
+def test_there_are_as_many_minibatches_as_asked_for():
+    """They are drawn several at once, here 16 of 1,024 transitions."""
+    memory = make_memory(batch_size=1024)
+    memory.extend(make_batch(0, 5))
+    for number in (1, 16, 33):
+        assert [len(minibatch) for minibatch in memory.minibatches(number)] == [1024] * number
+
+
 def test_the_oldest_go_first():
     memory = make_memory(capacity=6)
     for first in range(0, 10, 2):
@@ -113,12 +121,15 @@ def test_rows_that_end_keep_no_step_back(length, ends):
 def test_sums_do_not_go_on_in_other_trajectories():
     """As in batches of asynchronous collectors."""
     memory, ended = make_memory(n_steps=3), make_memory(n_steps=3)
-    for first, trajectory, is_last in ((0, 1, False), (4, 1, True), (50, 2, True)):
-        batch = make_batch(first, 4)
+    # the trajectory changes within a batch, between two batches, and where no episode has ended
+    for first, trajectories, is_last in (
+        *((0, [1, 1, 1, 2], False), (4, [2, 3, 3, 3], True), (50, [4, 4, 4, 4], True)),
+    ):
+        batch = make_batch(first, 4, ends=[2, 4])
         ended.extend(batch)
         if is_last:
             ended.end_rows()
-        batch["collector", "traj_ids"] = torch.full((2, 4), trajectory)
+        batch["collector", "traj_ids"] = torch.tensor(trajectories).expand(2, -1)
         memory.extend(batch)
     memory.end_rows()
     assert torch.equal(*(m.state_dict()["steps"]["steps_to_next_obs"] for m in (memory, ended)))
