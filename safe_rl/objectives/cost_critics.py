@@ -27,7 +27,7 @@ class CostCritics(QFunctionLoss):
     networks. For E = 2 and κ' = 1, this is the larger of the two values. The actor's loss gets the
     penalty r Σ_i λ_i (mean_E Q_i + κ std_E Q_i) / u_i, where u_i is the typical size of one cost
     and r the standard deviation of rewards. So with λ = 1, one cost weighs as much as a reward of
-    size r. Loss and penalty are divided by 1 + Σ λ_i / u_i: the step size does not grow with λ.
+    size r. Loss and penalty are divided by 1 + Σ λ_i: the step size does not grow with λ.
 
     In a class definition it comes before the loss without costs. The critic loss has to call
     `cost_qvalue_loss`, and the actor loss `penalised`.
@@ -179,7 +179,8 @@ class CostCritics(QFunctionLoss):
         samples = self.of_samples(values.detach(), tensordict, first=2)
         weights = self.cost_weights(samples).to(values)
         penalty = self.reward_unit * (self.cost_of(values) @ weights)
-        objective = (objective + penalty) / (1 + weights.sum())
+        # by λ, which has no unit: the size of the loss then does not depend on that of the costs
+        objective = (objective + penalty) / (1 + (weights * self.cost_unit).sum())
         figures = {"cost_qvalue": self.cost_values.mean(samples)}
         figures |= self.cost_values.figures(samples)
         reported = {name: each.flatten(0, -2).mean(0) for name, each in figures.items()}

@@ -115,7 +115,7 @@ class TD3Loss(QFunctionLoss, objectives.TD3Loss):
 
 
 class TD3LagrangianLoss(CostCritics, TD3Loss):
-    """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+    """TD3 on the Lagrangian: max_π E[Q_1 − r Σ_i w_i Q_i] / (1 + Σ_i λ_i), w = λ / u.
 
     `CostCritics` explains r and u. Arguments are those of `CostCritics` and `TD3Loss`.
 

@@ -117,7 +117,7 @@ class SACLoss(QFunctionLoss, objectives.SACLoss):
 
 
 class SACLagrangianLoss(CostCritics, SACLoss):
-    """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i w_i), w = λ / u.
+    """SAC on the Lagrangian: min_π E[α log π − min Q_r + r Σ_i w_i Q_i] / (1 + Σ_i λ_i), w = λ / u.
 
     Ha et al., *Learning to Walk in the Real World with Minimal Human Effort* (2020). λ is not
     updated here, but from the undiscounted costs of episodes. `CostCritics` explains r and u.
@@ -236,7 +236,9 @@ class CALLoss(SACLagrangianLoss):
         expected = discounted_share(self.gamma, limits.length_for(limits.cost))
         if number.any():
             news = torch.stack([total / number, limits.cost])
-            self.known_costs.lerp_(news, 1 - self.ratio_memory)
+            averages = self.known_costs.lerp(news, 1 - self.ratio_memory)
+            # J_c is NaN as long as no episode says what it is
+            self.known_costs.copy_(averages.where(limits.cost.isfinite(), self.known_costs))
             self.predicted_costs.zero_()
         by_critics, by_episodes = self.known_costs
         ratio = torch.where(by_episodes > 0, by_critics / by_episodes, expected)

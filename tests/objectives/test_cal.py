@@ -61,7 +61,7 @@ def test_its_gradient_is_that_of_the_augmented_lagrangian(away, is_active):
     assert tuple((found["cost_weight"] > 0).tolist()) == is_active
     parameter = next(p for p in loss.actor_network_params.values(True, True) if p.requires_grad)
     gradient = torch.autograd.grad(found["loss_actor"], parameter)[0].flatten()
-    gradient = gradient * (1 + found["cost_weight"].sum())
+    gradient = gradient * (1 + found["cost_weight"] @ unit)
     flat = parameter.data.view(-1)
     for place in range(0, flat.numel(), 3):
         sides = []
@@ -92,6 +92,16 @@ def test_the_limit_is_where_critics_say_that_episodes_are_at_theirs():
     torch.testing.assert_close(loss.discounted_limit, torch.tensor([1.75, 0.7]))
     weights = loss.cost_weights(torch.tensor([1.8, 0.65]).expand(1, 4, 6, 2))
     torch.testing.assert_close(weights, torch.tensor([1.5, 0.5]))
+
+
+def test_a_cost_that_no_episode_has_told_yet_leaves_the_averages_alone():
+    loss = make_loss(gamma=0.99)
+    for costs in ([torch.nan, 40.0], [50.0, 40.0]):
+        loss.cost_weights(torch.full((1, 4, 6, 2), 2.0))
+        prepare(loss, costs)
+    weight = 1 - loss.ratio_memory
+    torch.testing.assert_close(loss.known_costs[:, 0], weight * torch.tensor([2.0, 50.0]))
+    assert loss.discounted_limit.isfinite().all()
 
 
 def test_the_limit_follows_what_batches_say_and_not_too_far():

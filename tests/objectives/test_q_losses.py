@@ -123,7 +123,7 @@ def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     values = loss.cost_qvalue_network(steps.clone().set("action", action))["cost_value"]
     spread = (values - values.mean(0)).square().mean(0).sqrt()
     penalty = ((values.mean(0) + 0.5 * spread) * torch.tensor([2.0, 6.0])).sum(-1).mean()
-    torch.testing.assert_close(found["loss_actor"], (reward + 0.25 * penalty) / 9)
+    torch.testing.assert_close(found["loss_actor"], (reward + 0.25 * penalty) / 6)
     torch.testing.assert_close(found["cost_qvalue"], values.mean((0, 1)))
 
 
