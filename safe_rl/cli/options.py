@@ -13,7 +13,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -82,7 +82,7 @@ def make_options(given: Mapping[str, Any], schema: type[Options]) -> Options:
         if name not in kinds:
             raise SettingError(
                 f"Unknown option '{name}'.{did_you_mean(name, kinds)} "
-                f"Options are: {', '.join(kinds)}."
+                f"Options are: {', '.join(map(_shown, fields(schema)))}."
             )
         OmegaConf.update(read, key, _plain(value), force_add=True)
     settings: Any = OmegaConf.to_container(read)
@@ -150,12 +150,16 @@ def split_imports(words: Sequence[str]) -> tuple[list[str] | None, list[str]]:
     return (list(dict.fromkeys(filter(None, modules))) if given else None), others
 
 
+def _shown(field: Field[Any]) -> str:
+    return f"{field.name}.…" if field.default is MISSING else field.name
+
+
 def usage(command: str, schema: type[DataclassInstance]) -> str:
     """The help of a command: how it is called, its options, their defaults and meanings."""
     lines = [f"usage: {command} [option=value ...]", ""]
     for field in fields(schema):
         default = "null" if field.default is None else str(field.default).lower()
-        shown = f"{field.name}.…" if field.default is MISSING else f"{field.name}={default}"
+        shown = _shown(field) if field.default is MISSING else f"{field.name}={default}"
         lines.append(f"  {shown:<24} {field.metadata['help']}")
     lines.append(f"  {'import=…':<24} a module or file of yours to import before; may be repeated")
     return "\n".join(lines)
@@ -184,12 +188,17 @@ def run_command(
     words = sys.argv[1:] if arguments is None else list(arguments)
     is_help = words[:1] in (["-h"], ["--help"])
     modules, words = split_imports(words)
-    if is_help or len(words) < len(places):
-        print(usage(" ".join([program, *places]), schema))
-        return 0 if is_help else 2
     try:
+        if is_help or len(words) < len(places):
+            print(usage(" ".join([program, *places]), schema), flush=True)
+            return 0 if is_help else 2
         number = len(places)
-        return work(words[:number], read_options(words[number:], schema), modules)
+        status = work(words[:number], read_options(words[number:], schema), modules)
+        sys.stdout.flush()  # at exit Python would say that a pipe is closed
+        return status
+    except BrokenPipeError:  # nobody reads the rest, as in `| head`
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        return 1
     except _EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

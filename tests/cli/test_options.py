@@ -2,7 +2,9 @@
 
 import io
 import logging
+import os
 import re
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -116,3 +118,14 @@ def test_an_error_cannot_control_the_terminal(capsys):
 
     assert run_command(fail, ["run"], "safe-rl evaluate", ["RUN"], EvaluationOptions) == 1
     assert capsys.readouterr().err == "error: a robot named ?]0;mine?\n"
+
+
+def test_a_reader_that_has_read_enough_is_no_error(monkeypatch, capsys):
+    """`safe-rl evaluate RUN | head -1` said "error: Broken pipe"."""
+    readable, writable = os.pipe()
+    os.close(readable)
+    monkeypatch.setattr(sys, "stdout", os.fdopen(writable, "w"))
+    work = lambda *arguments: print("a result") or 0  # noqa: E731
+    assert run_command(work, ["run"], "safe-rl evaluate", ["RUN"], EvaluationOptions) == 1
+    sys.stdout.close()
+    assert capsys.readouterr().err == ""
