@@ -134,10 +134,14 @@ def _plain(value: Any) -> Any:
 
 
 def take_word(name: str, words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split words into the values of all ``name=value``, and the other words."""
+    """Split words into the values of all ``name=value``, and the other words.
+
+    Quotes of Hydra's grammar around a value are taken off.
+    """
     given = [word for word in words if word.lstrip("+").startswith(f"{name}=")]
     others = [word for word in words if word not in given]
-    return [word.partition("=")[2] for word in given], others
+    values = (word.partition("=")[2] for word in given)
+    return [re.sub(r"""^(['"])(.*)\1$""", r"\2", value) for value in values], others
 
 
 def split_imports(words: Sequence[str]) -> tuple[list[str] | None, list[str]]:

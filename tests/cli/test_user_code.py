@@ -41,6 +41,7 @@ def test_modules_of_a_command_are_split_from_its_words():
     assert split_imports(words) == (["mine", "b/c.py", "it's/x.py"], ["seed=1"])
     assert split_imports(["seed=1"]) == (None, ["seed=1"])
     assert split_imports(["import=[]"]) == ([], [])
+    assert split_imports(["import='my folder/x.py'"]) == (["my folder/x.py"], [])  # as Hydra's are
 
 
 def test_modules_are_found_by_name_and_by_file(folder):
