@@ -18,6 +18,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from safe_rl.checks import SettingError
+
+#: Largest number of constraints k, because memory and time grow with 2ᵏ: 1 GB and 2 s for 16.
+_MOST_CONSTRAINTS = 16
 #: Tolerance on constraints, in units of the radius of the trust region.
 _FEASIBILITY = 1e-6
 #: Smallest sine of the angle between the gradients of constraints that are active together.
@@ -86,7 +90,16 @@ def solve_dual(q: Tensor, r: Tensor, S: Tensor, c: Tensor, delta: Tensor | float
     Returns:
         A `DualSolution`, in the dtype of `q`. For k = 1 its cases and multipliers are those of
         Achiam et al. 2017, appendix 10.2.
+
+    Raises:
+        SettingError: If there are more than 16 constraints.
     """
+    if r.shape[-1] > _MOST_CONSTRAINTS:
+        raise SettingError(
+            f"{r.shape[-1]} limited costs: CPO's step takes at most {_MOST_CONSTRAINTS}, because "
+            "it tries all sets of them. Algorithms with multipliers, such as ppo_lagrangian, take "
+            "any number."
+        )
     delta = torch.as_tensor(delta, dtype=torch.float64, device=q.device)
     gradient = q.double().clamp_min(0).sqrt()
     lengths = S.double().diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()

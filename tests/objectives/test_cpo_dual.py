@@ -132,3 +132,9 @@ def test_single_precision_inputs_of_nearly_parallel_gradients():
     assert solution.lam.dtype == torch.float32
     # Rounding can lengthen a step that is a difference of large parts; line searches shorten it.
     assert np.median(np.linalg.norm(step, axis=-1)) < 1.1 * RADIUS
+
+
+def test_more_constraints_than_memory_allows_are_refused():
+    vectors = torch.eye(20, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"20 limited costs: .* at most 16.*ppo_lagrangian"):
+        solve_dual(torch.tensor(1.0), vectors[0], vectors, -vectors[0], 0.01)
