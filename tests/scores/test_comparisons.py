@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
+from safe_rl.scores import comparisons
 from safe_rl.scores.comparisons import (
     bootstrap,
     cvar,
@@ -20,6 +21,7 @@ from safe_rl.scores.comparisons import (
     mean,
     pareto_front,
     share_over,
+    t_interval,
 )
 
 
@@ -52,6 +54,7 @@ def test_strata_are_resampled_apart():
 def test_what_is_no_number_has_no_interval_and_no_warning(recwarn):
     assert np.isnan(mean([1.0, math.nan, 2.0])).all()
     assert np.isnan(interquartile_mean([[1.0, math.nan], [2.0, 3.0]])).all()
+    assert np.isnan(mean([1.0, math.inf, 2.0])[1:]).all()
     assert not recwarn.list
 
 
@@ -61,6 +64,25 @@ def test_many_curves_at_once_are_many_curves():
     # with three seeds the same one is drawn thrice in 1 of 27 cases, which is more than 2.5 %
     np.testing.assert_allclose(low, values.min(-1))
     np.testing.assert_allclose(high, values.max(-1))
+
+
+def test_the_same_samples_give_the_same_interval_in_portions_of_any_size(monkeypatch):
+    values = np.random.default_rng(3).normal(size=50)
+    first = mean(values)
+    assert mean(values) == first
+    monkeypatch.setattr(comparisons, "_PORTION", 10)  # fewer numbers than one resample has
+    assert mean(values) == pytest.approx(first)
+
+
+def test_students_interval_of_every_row(recwarn):
+    values = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 30.0]])
+    # with two degrees of freedom the quantile is 4.302653; variances are 1 and 300
+    centre, reach = np.array([2.0, 10.0]), 4.302653 * np.sqrt([1 / 3, 100])
+    low, high = t_interval(values)
+    np.testing.assert_allclose(low, centre - reach, rtol=1e-6)
+    np.testing.assert_allclose(high, centre + reach, rtol=1e-6)
+    assert np.isnan(t_interval([[1.0], [2.0]])).all()
+    assert not recwarn.list
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.37, 1.0])
@@ -77,6 +99,12 @@ def test_cvar_solves_the_program_of_rockafellar_and_uryasev(alpha):
     estimate = cvar(values, alpha)
     assert estimate.value == pytest.approx(solution.fun)
     assert estimate.low <= estimate.value <= estimate.high
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.1, math.nan])
+def test_a_tail_is_a_share_of_the_values(alpha):
+    with pytest.raises(ValueError, match="must be a share of episodes"):
+        cvar([1.0, 2.0], alpha)
 
 
 def test_the_interval_of_a_share_is_wilsons():
