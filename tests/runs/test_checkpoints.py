@@ -8,7 +8,15 @@ import torch
 from torch import nn
 from torchrl.checkpoint import CheckpointError
 
-from safe_rl.runs.checkpoints import CheckpointStore, best_checkpoint
+from safe_rl.runs.checkpoints import (
+    CheckpointStore,
+    best_checkpoint,
+    check_interface,
+    hold,
+    is_finished,
+    policy_hash,
+    read_states,
+)
 from safe_rl.runs.folder import checkpoint_steps, checkpoints_in
 
 
@@ -27,6 +35,21 @@ def parts(value):
     network = nn.Linear(3, 2)
     nn.init.constant_(network.weight, value)
     return {"network": network, "counter": Counter(value)}
+
+
+def steps_in(folder):
+    return [checkpoint_steps(path) for path in checkpoints_in(folder)]
+
+
+def test_as_many_of_the_last_ones_are_kept_as_are_asked_for(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=2)
+    for steps in (10, 20, 30):
+        store.save(steps)
+    assert steps_in(store.last) == [20, 30]
+    # what has just been written stays, even if another one counts more steps
+    alone = CheckpointStore(tmp_path, parts(1), keep_last=1)
+    assert alone.save(25).exists()
+    assert steps_in(store.last) == [25]
 
 
 def test_several_best_ones_are_those_with_the_highest_scores(tmp_path):
@@ -62,6 +85,73 @@ def test_a_best_one_that_was_displaced_is_the_best_again_after_resuming_from_bef
     assert CheckpointStore(tmp_path, parts(1), keep_last=1, keep_best=2).save_best(5, 1.0)
     again.save(6)
     assert [checkpoint_steps(path) for path in checkpoints_in(store.best)] == [4]
+
+
+def test_the_best_one_of_the_steps_to_resume_from_stays_until_the_next_save(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=2)
+    store.save(1)
+    store.save_best(2, 5.0)
+    store.save(2)
+    store.save_best(3, 6.0)
+    assert steps_in(store.best) == [2, 3]
+    store.resume()
+    assert steps_in(store.best) == [2]
+
+
+def test_what_was_best_before_the_first_checkpoint_is_removed_by_starting_over(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=1)
+    assert store.resume() is None
+    store.begin()
+    store.save_best(1, 5.0)
+    assert store.resume(epochs=1) is None
+    assert steps_in(store.best) == []
+
+
+def test_the_newest_one_says_what_is_wrong_and_whether_the_run_is_finished(tmp_path):
+    store = CheckpointStore(tmp_path, parts(1), keep_last=2)
+    store.save(10)
+    store.save(20)
+    assert [is_finished(checkpoints_in(store.last), frames) for frames in (20, 21)] == [True, False]
+    for path in checkpoints_in(store.last):
+        path.write_text("damaged")
+    with pytest.raises(CheckpointError, match="000020"):
+        store.resume()
+
+
+def test_the_hash_is_that_of_the_weights_of_the_actor(tmp_path):
+    def hash_of(actor, **others):
+        return policy_hash(
+            CheckpointStore(tmp_path, {"actor": actor, **others}, keep_last=1).save(1)
+        )
+
+    first = nn.Linear(3, 2)
+    same = copy.deepcopy(first)
+    assert hash_of(first) == hash_of(same, counter=Counter(2), critic=nn.Linear(1, 1))
+    nn.init.ones_(first.weight)
+    assert hash_of(first) != hash_of(same)
+    # as many ones in another shape
+    wide = nn.Linear(2, 3)
+    hashes = set()
+    for actor in (first, wide):
+        nn.init.ones_(actor.weight)
+        hashes.add(hash_of(nn.ParameterDict({"weight": actor.weight})))
+    assert len(hashes) == 2
+
+
+def test_what_is_held_is_read_after_its_file_is_gone(tmp_path):
+    path = CheckpointStore(tmp_path, parts(3), keep_last=1).save(10)
+    held = hold(path)
+    path.unlink()
+    assert read_states(held, ["counter"]) == {"counter": {"value": 3}}
+
+
+def test_what_is_held_is_not_damaged(tmp_path):
+    path = CheckpointStore(tmp_path, parts(1), keep_last=1).save(10)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"\x00\x00\x80\x3f" * 6) + 2] ^= 1  # as above
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=path.name):
+        hold(path)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "text", "missing"])
@@ -169,6 +259,33 @@ def test_a_checkpoint_of_another_seed_is_not_resumed_from(tmp_path):
     CheckpointStore.load(path, {"counter": counter})
     CheckpointStore(tmp_path, {"counter": counter}, keep_last=1).save(20)
     assert other.resume().name.endswith("20.torchrl")
+
+
+def test_a_checkpoint_that_lacks_a_fact_is_resumed_from(tmp_path):
+    counter = Counter(1)
+    CheckpointStore(tmp_path, {"counter": counter}, keep_last=1, run={"seed": 3}).save(10)
+    later = CheckpointStore(tmp_path, {"counter": counter}, keep_last=1, run={"seed": 3, "new": 1})
+    assert later.resume().name.endswith("10.torchrl")
+
+
+@pytest.mark.parametrize(
+    ("columns", "sensors", "words"),
+    [
+        (["b", "a"], {"bins": 16}, "their order is another one"),
+        (["a", "b"], {"bins": 8}, "their bins is 16, and that of this environment 8"),
+        (["a", "c"], {"bins": 16}, "they have b, where this environment has c"),
+    ],
+)
+def test_other_observations_than_those_of_the_policy_are_refused(tmp_path, columns, sensors, words):
+    known = {"columns": ["a", "b"], "sensors": {"bins": 16}}
+    store = CheckpointStore(tmp_path, parts(1), keep_last=1, interface=lambda: known)
+    path = store.save(10)
+    check_interface(path, known)
+    with pytest.raises(CheckpointError, match=words):
+        check_interface(path, {"columns": columns, "sensors": sensors})
+    # one that says nothing of them is not checked
+    silent = CheckpointStore(tmp_path, parts(1), keep_last=1).save(10)
+    check_interface(silent, {"columns": columns, "sensors": sensors})
 
 
 def test_a_full_disk_leaves_the_checkpoints_that_were_there(tmp_path, monkeypatch):
