@@ -48,6 +48,17 @@ def test_a_continued_table_keeps_the_rows_it_is_told_to(tmp_path):
         read_table(path)
 
 
+def test_a_table_of_fewer_rows_than_are_to_be_kept_is_refused(tmp_path):
+    path = tmp_path / "progress.csv"
+    with pytest.raises(TableError, match="holds 0 complete rows"):
+        TableWriter(path, keep_rows=1)
+    path.write_text("epoch\n1\n2\n")
+    with pytest.raises(TableError, match=r"holds 2 complete rows.* 3 epochs"):
+        TableWriter(path, keep_rows=3)
+    TableWriter(path, keep_rows=2)
+    assert read_table(path) == {"epoch": [1.0, 2.0]}
+
+
 def test_a_header_without_rows_gives_empty_columns(tmp_path):
     path = tmp_path / "progress.csv"
     path.write_text("epoch,steps\n")
