@@ -1,10 +1,12 @@
 """Filtered, delayed and held actions, against single steps of the same environment."""
 
 from functools import partial
+from operator import itemgetter
 
 import pytest
 import torch
 from point_mass import PointMass
+from torchrl.data import OneHot
 from torchrl.envs import ActionScaling, Compose, TransformedEnv
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
@@ -82,6 +84,30 @@ def test_a_filter_may_work_in_place_on_what_it_gets():
     assert torch.equal(same["observation"], before["observation"])
 
 
+def test_a_filter_without_a_signature_gets_the_step():
+    env = transformed(PointMass(2), f=ActionFilter(itemgetter("action")))
+    assert (env.rollout(2)["next", "cost_interventions"] == 0).all()
+
+
+class Choosing(PointMass):
+    """Stays where it is, whichever of three actions is chosen, and notes it."""
+
+    def __init__(self):
+        super().__init__(2)
+        self.action_spec, self.taken = OneHot(3, shape=(2, 3)), []
+
+    def _step(self, tensordict):
+        self.taken.append(tensordict["action"].long().tolist())
+        return super()._step(tensordict.clone().set("action", torch.zeros(2, 2)))
+
+
+def test_a_delay_of_choices_begins_with_the_first():
+    env = Choosing()
+    late = transformed(env, delay=ActionDelay(1))
+    late.step(late.reset().set("action", torch.tensor([[0, 0, 1], [0, 0, 1]])))
+    assert env.taken == [[[1, 0, 0], [1, 0, 0]]]
+
+
 def test_what_is_pending_ends_with_the_episode_of_its_row():
     env = transformed("point_mass", delay=ActionDelay(1))
     state = env.reset().set("action", torch.ones(3, 2))
@@ -142,6 +168,24 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     held, steps = still(env, 1)["next"], still(single, 4)["next"]
     assert held["steps_taken"].flatten().tolist() == [2, 4, 3]
     assert torch.equal(held["observation"][1, -1], steps["observation"][1, -1])
+
+
+class Refusing(PointMass):
+    """A row that has ended takes no step."""
+
+    def _step(self, tensordict):
+        assert (self._step_count < self.max_episode_steps).all()
+        return super()._step(tensordict)
+
+
+def test_rows_that_have_ended_begin_anew_where_they_could_not_step():
+    env = transformed(Refusing(2), repeat=ActionRepeat(4))
+    env.reset()
+    state = env.get_state()
+    state["step_count"][0] = env.max_episode_steps - 2
+    step = env.step(env.set_state(state).set("action", torch.zeros(2, 2)))["next"]
+    assert step["steps_taken"].flatten().tolist() == [2, 4]
+    assert step["done"].flatten().tolist() == [True, False]
 
 
 def test_episodes_of_a_row_do_not_depend_on_other_rows():

@@ -25,6 +25,7 @@ from safe_rl.envs.transforms import (
     EarlyTermination,
     ObservedCosts,
     Saute,
+    SensorNoise,
 )
 from safe_rl.trust import TargetError, allow
 
@@ -159,6 +160,32 @@ def test_episodes_of_an_evaluation_are_whole_unless_they_are_to_end_too(in_evalu
     batch = still(transformed(Priced([[3.0] * 6]), end=end, evaluating=True), 6)["next"]
     assert batch["terminated"].squeeze().nonzero()[:, 0].tolist() == ends
     assert batch["done"].squeeze().nonzero()[:, 0].tolist() == (ends or [5])
+
+
+def test_a_state_shares_no_memory_with_the_environment():
+    env = transformed(Priced([[0.5] * 9]), "saute")
+    still(env, 1)
+    budget = ("transforms", "saute", "budget")
+    left = (1 - 0.5 / 2) / 0.9
+    state = env.get_state()
+    for change in (lambda: None, lambda: env.set_state(state.set(budget, state[budget] + left))):
+        change()
+        state[budget].zero_()
+        assert env.get_state()[budget].item() == pytest.approx(left)
+
+
+def test_what_stands_outside_keeps_the_returns_and_decisions_of_what_is_inside():
+    env = transformed(PointMass(1), "saute", "noise", repeat=ActionRepeat(4))
+    outer = transformed(env, late=SensorNoise(0.1))
+    assert (outer.return_key, outer.steps_per_decision) == ("task_reward", 4)
+    assert transformed(PointMass(1), "saute", "noise").return_key == "task_reward"
+
+
+def test_transforms_do_not_share_their_draws():
+    exact, noisy = PointMass(4000), PointMass(4000)
+    noisy = transformed(noisy, one=SensorNoise(0.3), other=SensorNoise(0.4), seed=0)
+    noise = noisy.reset()["observation"] - exact.reset()["observation"]
+    assert noise.std().item() == pytest.approx(0.5, rel=0.05)  # shared ones: 0.7
 
 
 def test_transforms_of_torchrl_can_stand_among_ours():
