@@ -1,5 +1,6 @@
 """Signals: what they end, when, and what they leave alone; the state of random generators."""
 
+import os
 import signal
 import threading
 from types import SimpleNamespace
@@ -8,9 +9,16 @@ import pytest
 import torch
 from point_mass_runs import point_mass_trainer
 from tensordict import TensorDict
+from torchrl.checkpoint import GlobalRNGState
 
 from safe_rl.runs.table import read_table
-from safe_rl.training.state import EnvSnapshot, RandomGenerators, catching_signals
+from safe_rl.training.state import (
+    EnvSnapshot,
+    Progress,
+    RandomGenerators,
+    catching_signals,
+    staggered_steps,
+)
 
 
 def signal_in(trainer, epoch, number):
@@ -64,6 +72,22 @@ def test_a_second_interrupt_acts_at_once():
             signal.raise_signal(signal.SIGINT)
 
 
+def test_a_terminal_that_is_ignored_or_closed_stops_no_run(monkeypatch):
+    def fail(*arguments):
+        raise OSError
+
+    monkeypatch.setattr(os, "write", fail)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with catching_signals() as received:
+            signal.raise_signal(signal.SIGHUP)
+            assert not received
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert received == [signal.SIGTERM]
+
+
 def test_signals_are_left_alone_outside_the_main_thread():
     def request():
         with catching_signals():
@@ -86,10 +110,40 @@ def test_a_machine_without_accelerators_restores_the_generator_of_its_cpu(monkey
     assert torch.equal(torch.rand(3), drawn)
 
 
+def test_counters_of_a_run_that_has_just_begun_are_restored():
+    progress = Progress(3, 40, 5.0)
+    progress.load_state_dict(Progress().state_dict())
+    assert progress == Progress()
+
+
+def test_as_many_generators_are_restored_as_there_are_accelerators(monkeypatch):
+    for kind, count in {"cuda": 1, "xpu": 0, "mps": 1}.items():
+        monkeypatch.setattr(getattr(torch, kind), "device_count", lambda count=count: count)
+    restored = {}
+    monkeypatch.setattr(GlobalRNGState, "load_state_dict", lambda _, s: restored.update(s))
+    state = {"torch_cpu": "a", "torch_cuda": ["b", "c"], "torch_xpu": ["d"], "torch_mps": "ef"}
+    RandomGenerators().load_state_dict(state)
+    assert restored == {"torch_cpu": "a", "torch_cuda": ["b"], "torch_mps": "ef"}
+    assert len(state) == 4
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [({"step_count": 0}, [0, 4, 8, 16]), ({"other": 0}, None), (None, None)],
+)
+def test_rows_start_at_decisions_spread_over_the_longest_episode(state, expected):
+    # of 22 steps: 0, 5, 11, 16 rounded down
+    world = {"batch_size": torch.Size([4]), "max_episode_steps": 22, "steps_per_decision": 4}
+    steps = staggered_steps(SimpleNamespace(get_state=lambda: state, **world))
+    assert (steps if steps is None else steps.tolist()) == expected
+
+
 def test_a_state_from_a_file_goes_to_the_devices_of_the_environment():
     present = TensorDict({"a": torch.ones(2), "t": {"x": torch.ones(2)}}, [2]).to("meta")
     met = []
     env = SimpleNamespace(get_state=lambda: present, set_state=met.append, batch_size=[2])
     snapshot = EnvSnapshot(env, SimpleNamespace(_carrier=SimpleNamespace(update=lambda _: None)))
-    snapshot.load_state_dict({"a": torch.ones(2), "t": {"x": torch.ones(2)}})
+    # an entry that the present state lacks stays where it is
+    snapshot.load_state_dict({"a": torch.ones(2), "t": {"x": torch.ones(2)}, "b": torch.ones(2)})
+    assert met[0].pop("b").device.type == "cpu"
     assert {value.device.type for value in met[0].values(True, True)} == {"meta"}
