@@ -70,6 +70,12 @@ def test_a_precision_of_the_users_is_kept(of_use):
         assert of_use.fp32_precision == "ieee"
 
 
+def test_a_torch_without_it_keeps_its_own(of_use, monkeypatch):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    with fast_products():
+        assert of_use.fp32_precision == "none"
+
+
 def test_training_has_it_for_updates_alone(of_use, tmp_path):
     trainer = point_mass_trainer(tmp_path, "algo=ppo", "frames=160")
     learn, seen = trainer.algorithm.learn, []

@@ -65,6 +65,20 @@ def test_the_exploration_type_is_afterwards_what_it_was(two_threads):
     assert exploration_type() == before
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_both_are_called_with_the_exploration_type_of_losses(number):
+    with torch_threads(number), set_exploration_type(ExplorationType.RANDOM):
+        found = in_parallel(exploration_type, exploration_type)
+    assert found == (ExplorationType.DETERMINISTIC, ExplorationType.DETERMINISTIC)
+
+
+def test_with_one_thread_one_is_called_after_the_other():
+    calls = []
+    with torch_threads(1):
+        in_parallel(*(lambda n=n: calls.append((n, threading.get_ident())) for n in (1, 2)))
+    assert calls == [(n, threading.get_ident()) for n in (1, 2)]
+
+
 def test_threads_are_shared_and_given_back(two_threads):
     assert in_parallel(torch.get_num_threads, torch.get_num_threads) == (1, 1)
     assert torch.get_num_threads() == 2
