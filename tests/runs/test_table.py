@@ -5,7 +5,15 @@ import math
 
 import pytest
 
-from safe_rl.runs.table import TableError, TableWriter, read_table
+from safe_rl.runs.table import (
+    TableError,
+    TableWriter,
+    feasible_return,
+    final_figures,
+    outcome_line,
+    read_table,
+    violation,
+)
 
 
 def test_rows_are_on_disk_at_once_and_read_back_exactly(tmp_path):
@@ -95,3 +103,42 @@ def test_a_table_that_was_changed_is_told_in_a_line(change, message, tmp_path):
     path.write_bytes(change(path.read_bytes()))
     with pytest.raises(TableError, match=message):
         TableWriter(path, keep_rows=2).write({"epoch": 3, "steps": 30})
+
+
+def test_a_violation_that_was_not_measured_is_that_of_the_mean():
+    row = {"episode_cost": 30.0, "violation_cost": math.nan}
+    assert violation(row, "cost", 25.0) == 5.0
+
+
+def test_epochs_without_an_episode_have_no_feasible_return():
+    rows = [{"episode_return": math.nan, "episode_cost": math.nan}]
+    assert feasible_return(rows, {}) is None
+    rows.append({"episode_return": 6.0, "episode_cost": 20.0})
+    assert feasible_return(rows, {"cost": 25.0}) == 6.0
+
+
+def test_final_figures_leave_out_epochs_before_and_without_episodes():
+    epochs = 8
+    returns = [float(epoch) for epoch in range(epochs)]
+    returns[6] = math.nan
+    table = {
+        "steps": [100.0 * (epoch + 1) for epoch in range(epochs)],
+        "time_total": [1.0 + epoch for epoch in range(epochs)],
+        "episode_return": returns,
+        "episode_cost": [10.0 * value for value in returns],
+        "violation_cost": [10.0 * value - 25.0 for value in returns],
+        "cost_rate": [0.01 * epoch for epoch in range(epochs)],
+    }
+    final = final_figures(table, ["cost"])
+    # epochs 2, 3, 4, 5 and 7, whose mean is 4.2
+    assert final == pytest.approx(
+        {
+            "episode_return": 4.2,
+            "episode_cost": 42.0,
+            "violation_cost": 17.0,
+            "cost_rate": 0.07,
+            "steps_per_second": 100.0,
+        }
+    )
+    line = outcome_line(table, {}, 50, "mean")
+    assert line == "Return 4.20, cost 42.0 per episode, mean of steps 201 to 800; 100 steps/s"
