@@ -15,6 +15,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from safe_rl.checks import SettingError
+
 ESTIMATOR = "_value_estimator."
 """Prefix of buffers of value estimators: settings that a resumed run may change."""
 
@@ -87,11 +89,11 @@ def reported_kl(losses: TensorDictBase) -> Tensor:
     """The KL divergence that the loss reports, for early stopping.
 
     Raises:
-        ValueError: If it reports none, or more than one number.
+        SettingError: If it reports none, or more than one number.
     """
     kl = losses.get("kl", None)
     if kl is None or kl.numel() != 1:
-        raise ValueError(
+        raise SettingError(
             "max_kl ends an update by the scalar 'kl' that its loss reports, and this one reports "
             f"{'none' if kl is None else f'one of shape {list(kl.shape)}'}: use max_kl=null and "
             "adapt_rate=null."

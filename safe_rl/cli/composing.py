@@ -210,14 +210,16 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
     if part == {} and section != "transforms" and not is_swept:  # made to hold this key
         return f"this algorithm has no '{section}'."
     hint = f"If only swept algorithms have it, write '++{key}=…'." if is_swept else ""
-    target = str(part.get("_target_")) if OmegaConf.is_dict(part) else "None"
+    node = error.parent_node
+    target = str(node.get("_target_")) if OmegaConf.is_dict(node) else "None"
     if section == "env" and "kwargs" in part:
         name = key.removeprefix("env.").removeprefix("kwargs.")
         known = [f"env.{other}" for other in part if nearest(name, [str(other)], 0.7)]
         arguments = f"Arguments of its constructor are given as env.kwargs='{{{name}: …}}'."
         hint = "" if known else arguments
     elif key.endswith("._target_") or not target.startswith(("safe_rl.", "None")):
-        known = [] if key.endswith("._target_") else known
+        named = [name for name in known if "._" not in name]
+        known = [] if key.endswith("._target_") else named
         hint = f"What a class of yours takes is added: '+{key}=…'."
     return unknown_key(key, known, hint)
 

@@ -43,7 +43,7 @@ def pareto_front(returns: ArrayLike, costs: ArrayLike) -> np.ndarray:
     """
     returns, costs = np.asarray(returns, dtype=float), np.asarray(costs, dtype=float)
     order = np.lexsort((-returns, costs))
-    best = np.maximum.accumulate(np.concatenate([[-np.inf], returns[order]]))[:-1]
+    best = np.fmax.accumulate(np.concatenate([[-np.inf], returns[order]]))[:-1]
     return order[returns[order] > best]
 
 

@@ -232,9 +232,8 @@ def _prepare(
     length = trainer.env.max_episode_steps
     if frames < (first := config.num_envs * length):
         print_line(
-            f"No episode will end: {config.num_envs} environments with episodes of {length:,} "
-            f"steps end the first ones after {first:,} frames. "
-            "Set frames=… or num_envs=…"
+            f"No episode will reach its last step: {config.num_envs} environments with episodes of "
+            f"{length:,} steps reach it after {first:,} frames. Set frames=… or num_envs=…"
         )
     return trainer
 

@@ -11,6 +11,7 @@ from run_configs import CONF
 
 from safe_rl import trust
 from safe_rl.algorithms import Constraints
+from safe_rl.checks import SettingError
 from safe_rl.evaluation.settings import certificate_options
 from safe_rl.objectives import PPOLoss
 from safe_rl.runs.run import Run
@@ -69,7 +70,7 @@ def test_a_run_learns_with_a_loss_of_torchrls(name, tmp_path, monkeypatch):
     """What is not one number for each of its constraints is logged as a scalar."""
     monkeypatch.setitem(trust._ROOMS, "torchrl.objectives", None)
     keys = ("algo=ppo", f"loss._target_=torchrl.objectives.{name}")
-    with pytest.raises(ValueError, match="this one reports none: use max_kl=null and adapt"):
+    with pytest.raises(SettingError, match="this one reports none: use max_kl=null and adapt"):
         point_mass_trainer(tmp_path / "kl", *keys).run()
     free = ("policy_update.max_kl=null", "policy_update.adapt_rate=null")
     trainer = point_mass_trainer(tmp_path, *keys, *free)

@@ -195,7 +195,7 @@ def test_what_a_run_will_not_do_is_said(tmp_path, capsys):
     short = SMALL | {"env.num_steps": 60, "cost_limits": {"cost": 5}}
     safe_rl.train(algo="ppo", frames=40, directory=tmp_path / "run", **short)
     printed = capsys.readouterr().out
-    assert "No episode will end" in printed
+    assert "No episode will reach its last step" in printed
     assert "algo=ppo does not keep cost_limits" in printed
 
 

@@ -6,7 +6,7 @@ from operator import itemgetter
 import pytest
 import torch
 from point_mass import PointMass
-from torchrl.data import OneHot
+from torchrl.data import Bounded, OneHot
 from torchrl.envs import ActionScaling, Compose, TransformedEnv
 from transforming import ENVIRONMENTS, Priced, still, transformed
 
@@ -168,6 +168,20 @@ def test_a_row_that_ends_inside_a_repeat_stops_alone():
     held, steps = still(env, 1)["next"], still(single, 4)["next"]
     assert held["steps_taken"].flatten().tolist() == [2, 4, 3]
     assert torch.equal(held["observation"][1, -1], steps["observation"][1, -1])
+
+
+def test_an_action_that_is_held_for_one_step_stands_beside_other_transforms():
+    env = transformed(PointMass(2), late=ActionDelay(2), repeat=ActionRepeat(1))
+    assert (still(env, 3)["next", "steps_taken"] == 1).all()
+
+
+def test_bounds_of_sums_allow_for_a_last_decision_of_fewer_steps():
+    env = PointMass(1)
+    rewards = env.full_reward_spec.clone()
+    rewards["reward"] = Bounded(torch.ones(1, 1), 2 * torch.ones(1, 1))
+    env.full_reward_spec = rewards
+    spec = transformed(env, repeat=ActionRepeat(3)).full_reward_spec["reward"]
+    assert (spec.low.item(), spec.high.item()) == (1.0, 6.0)
 
 
 class Refusing(PointMass):

@@ -120,7 +120,8 @@ def test_a_cost_that_comes_late_and_is_not_counted_is_told():
     class WithItsLimit(Counter):
         def step(self, action):
             *values, info = super().step(action)
-            return *values, info | {"cost_limit": 25.0, "cost_total": 3.0}
+            late = {"cost_b": 1.0} if self.count == 3 else {}
+            return *values, info | {"cost_limit": 25.0, "cost_total": 3.0} | late
 
     env = from_gymnasium(Late, num_envs=1, num_steps=6, seed=5)
     with pytest.warns(UserWarning, match=r"info\['cost_b'\] is not counted.*cost,cost_l"):
@@ -129,6 +130,8 @@ def test_a_cost_that_comes_late_and_is_not_counted_is_told():
     assert env.cost_keys == ["cost", "cost_late"]
     with pytest.warns(UserWarning, match=r"info\['cost_limit'\] is not counted"):
         env.rollout(2)
+    with pytest.warns(UserWarning, match=r"info\['cost_b'\] is not counted"):
+        env.rollout(4)
 
 
 @pytest.mark.parametrize("name", ["reward", "a.b"])  # a step writes it; it would be nested

@@ -255,6 +255,10 @@ def filtered(function, **keys):
             lambda: transformed(PointMass(1), r=ActionRepeat(2), o=ObservedCosts(0.5)),
             r"'r' has to be the last one.*transforms=\[o,r\]",
         ),
+        (
+            lambda: transformed(PointMass(1), a=ActionRepeat(2), b=ActionRepeat(3)),
+            "'a' and 'b' hold actions: choose one",
+        ),
         (lambda: transformed(PointMass(1), o=ObservedCosts(0.5, ["coast"])), "no cost 'coast'"),
         *(
             (lambda t=t: TransformedEnv(PointMass(1), t).rollout(1), "no cost 'coast'")

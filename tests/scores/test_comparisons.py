@@ -133,6 +133,8 @@ def test_the_interquartile_mean_and_its_interval():
 def test_the_front_is_what_nobody_beats(points):
     returns, costs = zip(*points, strict=True)
     front = pareto_front(returns, costs).tolist()
+    # the last agent has not finished an episode
+    assert pareto_front([*returns, math.nan], [*costs, -1.0]).tolist() == front
 
     def beats(a, b):
         return a[0] >= b[0] and a[1] <= b[1] and a != b

@@ -100,6 +100,7 @@ class CheckedSteps(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, cost_keys: Sequence[str], watch: bool) -> None:
         super().__init__(env)
         self._cost_keys, self._step, self._watch = list(cost_keys), 0, watch
+        self._told: list[str] = []  # costs that are not counted, once each
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
         """Reset, and check the observation."""
@@ -129,7 +130,7 @@ class CheckedSteps(gymnasium.Wrapper):
         info = {**info, **dict(zip([COST], cost, strict=False))}
         if COST_SUM in info and COST_SUM not in self._cost_keys:  # no kind of its own
             info = {COST: info.pop(COST_SUM), **info}
-        if not cost:  # that of six values is of all kinds
+        if self._watch and not cost:  # that of six values is of all kinds
             self._tell_uncounted(info)
         info |= {k: self._number(f"info['{k}']", info[k]) for k in self._cost_keys if k in info}
         for name, end in (("terminated", terminated), ("truncated", truncated)):
@@ -138,15 +139,13 @@ class CheckedSteps(gymnasium.Wrapper):
         return observation, self._number("the reward", reward), terminated, truncated, info
 
     def _tell_uncounted(self, info: dict[str, Any]) -> None:
-        uncounted = [key for key in info if is_cost(key) and key not in self._cost_keys]
-        if uncounted and self._watch:
-            self._watch = False
-            kept = (
-                " 'cost' is taken as the environment gives it." if COST in self._cost_keys else ""
-            )
+        kept = " 'cost' is taken as the environment gives it." if COST in self._cost_keys else ""
+        known = (*self._cost_keys, *self._told)
+        for key in [key for key in info if is_cost(key) and key not in known]:
+            self._told.append(key)
             warnings.warn(
                 # without the step, which differs among rows: Python shows equal warnings once
-                f"info['{uncounted[0]}'] is not counted as a cost, because it is not in "
+                f"info['{key}'] is not counted as a cost, because it is not in "
                 f"env.cost_keys=[{','.join(self._cost_keys)}].{kept}",
                 stacklevel=2,
             )

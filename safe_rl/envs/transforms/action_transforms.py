@@ -180,7 +180,7 @@ class ActionRepeat(ConstraintTransform):
         """Return 0 as the number of steps that were taken."""
         beside = getattr(self.container.transform, "transforms", ())
         others = [t for t in beside if isinstance(t, ConstraintTransform) and t is not self]
-        if others:
+        if others and self.steps_per_decision > 1:
             raise ValueError(
                 f"{type(others[0]).__name__} must act at every step, but together with "
                 "ActionRepeat it would act at every decision: make the environment by "
@@ -224,16 +224,17 @@ class ActionRepeat(ConstraintTransform):
         return observation_spec
 
     def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
-        """Multiply the bounds by k."""
+        """Widen the bounds to those of k steps; the last decision of an episode may have fewer."""
         for key in list(reward_spec.keys(True, True)):
-            reward_spec[key] = _times(reward_spec[key], self.steps_per_decision)
+            reward_spec[key] = _of_steps(reward_spec[key], self.steps_per_decision)
         return reward_spec
 
 
-def _times(spec: TensorSpec, factor: int) -> TensorSpec:
-    """Multiply the bounds of a spec, if it has any."""
+def _of_steps(spec: TensorSpec, most: int) -> TensorSpec:
+    """The spec of a sum over 1 to `most` steps; one without bounds is returned unchanged."""
     if not isinstance(spec, Bounded):
         return spec
-    most = torch.finfo(spec.dtype).max
-    low, high = (torch.clamp(factor * bound, -most, most) for bound in (spec.low, spec.high))
+    highest = torch.finfo(spec.dtype).max
+    low = torch.minimum(spec.low, most * spec.low).clamp(min=-highest)
+    high = torch.maximum(spec.high, most * spec.high).clamp(max=highest)
     return Bounded(low, high, spec.shape, device=spec.device, dtype=spec.dtype)

@@ -291,6 +291,8 @@ def transform_env(
         if isinstance(transform, ConstraintTransform):
             transform.evaluating = evaluating
     held = [name for name, t in built.items() if getattr(t, "steps_per_decision", 1) != 1]
+    if len(held) > 1:
+        raise ValueError(f"transforms: '{held[0]}' and '{held[1]}' hold actions: choose one.")
     if held and held != list(built)[-1:]:
         raise ValueError(
             f"transforms: '{held[0]}' has to be the last one, because the others count steps of "
