@@ -27,8 +27,8 @@ class Constraints(Resumable):
     """Costs with limits d on J_c, the mean undiscounted cost of an episode.
 
     Call `update` with every batch. It returns a `LimitState`, which multipliers, losses and steps
-    take. Without a tracker, J_c is the mean of the episodes that finished in the batch, and its
-    target is d.
+    take. Without a tracker, J_c is the mean of the episodes that finished in the batch, or, in
+    batches shorter than an episode, the cost per step times the length; its target is d.
 
     Args:
         limits: Cost key -> d, undiscounted cost allowed per episode; empty without constraints.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
 from threading import RLock
@@ -23,6 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from safe_rl.checks import parameters_of
 from safe_rl.cli.config import General, keys_of, unknown_key
 from safe_rl.cli.folders import name_choices
 from safe_rl.cli.options import first_line, unreadable
@@ -33,7 +34,7 @@ from safe_rl.files import CONF, PROGRAM
 from safe_rl.naming import did_you_mean, nearest
 from safe_rl.runs.identity import RESUMABLE, differences, flatten
 from safe_rl.runs.run import Run
-from safe_rl.trust import check_imports
+from safe_rl.trust import check_imports, locate
 
 _MOST_LISTED = 40
 RESUMED = "resumed"
@@ -201,10 +202,9 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
         known += map(str, config)
     if section == "cost_limits":
         example = f"{{{key.partition('.')[2]}: 10}}"
-        return (
-            f"{key}: limits are given together, cost_limits='{example}'. To add this one to those "
-            f"of a file: +{key}=…"
-        )
+        given = config.get("cost_limits") not in ("default", {})  # {}: made to hold this key
+        added = f" To add this one to those of a file: +{key}=…" if given else ""
+        return f"{key}: limits are given together, cost_limits='{example}'.{added}"
     is_swept = any(re.match("algo=.*,", word) for word in words)
     part = config.get(section)
     if part == {} and section != "transforms" and not is_swept:  # made to hold this key
@@ -221,7 +221,17 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
         named = [name for name in known if "._" not in name]
         known = [] if key.endswith("._target_") else named
         hint = f"What a class of yours takes is added: '+{key}=…'."
+    elif (name := key.rpartition(".")[2]) in _arguments_of(target):
+        known, hint = [], f"This argument of {target} is added: '+{key}=…'."
     return unknown_key(key, known, hint)
+
+
+def _arguments_of(target: str) -> Collection[str]:
+    """Names of the arguments of a target; none if there is no such target."""
+    try:
+        return parameters_of(locate(target))
+    except ValueError:
+        return ()
 
 
 def read_resumed(

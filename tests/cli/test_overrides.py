@@ -40,7 +40,7 @@ WRONG = {
     "lagrangian=null": r"^there is no lagrangian 'null'\. There are adam, pi, pid",
     "+evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
     "evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
-    "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\. To",
+    "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
     "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
     "logger@mine=none": r"^Could not override 'logger@mine'\. Did you mean to override logger\?",
     "slate=SG7": "Unknown slate 'SG7'",
@@ -215,6 +215,8 @@ def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():
     shield = "transforms.action_filter.filter"
     with pytest.raises(ValueError, match=rf"no key '{shield}.lead'\. .*added: '\+{shield}.lead=…'"):
         composed("transforms=[action_filter]", f"{shield}._target_=my.shield", f"{shield}.lead=1")
+    with pytest.raises(ValueError, match=r"argument of .*SACLoss is added: '\+loss\.target_entropy"):
+        composed("algo=sac", "loss.target_entropy=-1")
     with pytest.raises(ValueError, match=r"Did you mean 'loss\.clip_epsilon'"):
         composed("loss._target_=safe_rl.objectives.PPOLoss", "loss.clip_epsilonn=3")
 
