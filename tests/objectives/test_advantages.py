@@ -84,9 +84,11 @@ def test_trajectories_behind_each_other_are_not_one():
     critic = make_critic()
     estimator = VectorGAE(critic, gamma=0.9, lmbda=0.9, value_target="lambda_return")
     rollout = make_rollout([critic])
-    rollout["collector", "traj_ids"] = torch.arange(N).unsqueeze(-1).expand(N, T)
-    found = estimator(rollout.reshape(-1))["advantage"].reshape(N, T, 1)
-    torch.testing.assert_close(found, estimator(rollout)["advantage"])
+    ids = torch.tensor([2, 0, 3, 1]).unsqueeze(-1).expand(N, T)
+    for given in (ids, ids.unsqueeze(-1)):
+        rollout["collector", "traj_ids"] = given
+        found = estimator(rollout.reshape(-1))["advantage"].reshape(N, T, 1)
+        torch.testing.assert_close(found, estimator(rollout)["advantage"])
 
 
 def test_each_observation_is_valued_once():
@@ -100,9 +102,10 @@ def test_each_observation_is_valued_once():
     assert sum(valued) == N * T + ends.sum()
 
 
-def test_normalisation():
+@pytest.mark.parametrize("size", [1.0, 1e-4])
+def test_normalisation(size):
     batch = TensorDict(
-        advantage=5 + 3 * torch.randn(6, 50, 1),
+        advantage=size * (5 + 3 * torch.randn(6, 50, 1)),
         cost_advantage=torch.tensor([2.0, 40.0]) * (torch.randn(6, 50, 2) + 1),
         batch_size=[6, 50],
     )
