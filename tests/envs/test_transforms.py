@@ -5,12 +5,14 @@ import math
 import pytest
 import torch
 from point_mass import PointMass
+from torchrl.data import Bounded
 from torchrl.envs import ActionDiscretizer, TransformedEnv
 from torchrl.envs.transforms import StepCounter
 from torchrl.envs.utils import check_env_specs
 from transforming import (
     ENVIRONMENTS,
     SAUTE,
+    SHORT,
     TRANSFORMS,
     Priced,
     half_speed,
@@ -18,10 +20,11 @@ from transforming import (
     transformed,
 )
 
-from safe_rl.envs import ConstrainedEnv, check_constrained_env, make_env
+from safe_rl.envs import ConstrainedEnv, SafetyGymEnv, check_constrained_env, make_env, rng
 from safe_rl.envs.transforms import (
     ActionFilter,
     ActionRepeat,
+    ConstraintTransform,
     EarlyTermination,
     ObservedCosts,
     Saute,
@@ -86,7 +89,7 @@ def test_rows_that_continue_keep_their_budget_when_others_begin():
 
 
 def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
-    costs = [[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.9]]
+    costs = [[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.9999]]
     plain = still(Priced(costs), 4)
     budgets = {"cost": 2.0, "cost_north": 40.0}  # one that is spent is enough
     saute = Saute(budgets, discount=1.0, unsafe_reward=-3.0, rescale_budgets=False)
@@ -100,6 +103,33 @@ def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
     # a step does not keep the reward that the last one has left in its TensorDict
     again = env.step(env.step(env.reset().set("action", torch.full((2, 2), -0.5))))["next"]
     assert torch.equal(again["task_reward"][1], again["reward"][1])
+
+
+class Doubled(ConstraintTransform):
+    return_key = "task_reward"
+
+    def _step(self, tensordict, next_tensordict):
+        reward = next_tensordict["reward"]
+        return next_tensordict.update({"task_reward": reward, "reward": 2 * reward})
+
+
+def test_the_first_of_several_that_change_the_reward_keeps_the_own_one():
+    costs = [[0.0, 0.0, 9.0, 0.0]]
+    own = still(Priced(costs), 4, -0.5)["next", "reward"]
+    env = transformed(Priced(costs), doubled=Doubled(), saute=Saute({"cost": 2.0}, **SAUTE))
+    batch = still(env, 4, -0.5)["next"]
+    assert torch.equal(batch["task_reward"], own)
+    assert torch.equal(batch["reward"][:, :2], 2 * own[:, :2])
+    assert (batch["reward"][:, 2:] == -1.0).all()
+
+
+def test_the_constant_reward_may_be_outside_the_bounds_of_the_own_one():
+    env = PointMass(1)
+    rewards = env.full_reward_spec.clone()
+    rewards["reward"] = Bounded(0, 1, (1, 1))
+    env.full_reward_spec = rewards
+    spec = transformed(env, "saute").full_reward_spec
+    assert spec["reward"].is_in(torch.tensor([[SAUTE["unsafe_reward"]]]))
 
 
 @pytest.mark.parametrize("cost", [1.0, 0.1, 0.7])
@@ -135,18 +165,21 @@ def test_the_budget_of_simmer_grows_from_episode_to_episode():
     env.continue_from(0)
     begins = still(env, 24)["observation"][0, ::4, -1]
     assert begins.tolist() == pytest.approx([0.25, 0.4375, 0.625, 0.8125, 1.0, 1.0])
-    again = transformed(Priced([[0.5] * 4]), "simmer")
-    for steps, share in ((8, 0.625), (12, 0.8125)):  # before the first reset, and after it
-        again.continue_from(steps)
-        assert again.reset()["observation"][0, -1].item() == pytest.approx(share)
+    for repeat in ({}, {"repeat": ActionRepeat(2)}):
+        again = transformed(Priced([[0.5] * 4]), "simmer", **repeat)
+        for steps, share in ((8, 0.625), (12, 0.8125)):  # before the first reset, and after it
+            again.continue_from(steps)
+            assert again.steps_before == steps
+            assert again.reset()["observation"][0, -1].item() == pytest.approx(share)
     solved = transformed(Priced([[0.5] * 4]), "simmer", evaluating=True)
     assert solved.reset()["observation"][0, -1].item() == 1.0
 
 
 def test_the_episode_ends_when_more_than_the_budget_is_spent():
-    costs = [[1.0, 1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 2.1], [0.0] * 6]
+    costs = [[1.0, 1.0, 0.5, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0, 2.0001], [0.0] * 6]
     end = EarlyTermination({"cost": 2.0, "cost_north": 40.0})  # one that is spent is enough
-    batch = still(transformed(Priced(costs), end=end), 6)["next"]
+    late = EarlyTermination({"cost": 100.0})  # leaves the ends of the other one
+    batch = still(transformed(Priced(costs), end=end, late=late), 6)["next"]
     terminated, truncated = batch["terminated"].squeeze(-1), batch["truncated"].squeeze(-1)
     # the first row begins anew, with its own costs, and ends again
     assert terminated.nonzero().tolist() == [[0, 2], [0, 5], [1, 5]]
@@ -172,6 +205,8 @@ def test_a_state_shares_no_memory_with_the_environment():
         change()
         state[budget].zero_()
         assert env.get_state()[budget].item() == pytest.approx(left)
+    begun = env.set_state(env.get_state())
+    assert begun["observation"][0, -1].item() == pytest.approx(left)
 
 
 def test_what_stands_outside_keeps_the_returns_and_decisions_of_what_is_inside():
@@ -181,11 +216,37 @@ def test_what_stands_outside_keeps_the_returns_and_decisions_of_what_is_inside()
     assert transformed(PointMass(1), "saute", "noise").return_key == "task_reward"
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("max_episode_steps", "seconds_per_step", "events", "sensor_keys", "privileged_layout"),
+        *("reuses_tensors", "steps_after_end", "get_positions", "render"),
+    ],
+)
+def test_what_no_transform_changes_is_that_of_the_inner_environment(name):
+    seeing = {"hazards_num": 1, "observe_hazards": True, "observe_privileged": True}
+    env = transformed(SafetyGymEnv(SHORT | seeing, 1, seed=0), "noise")
+    inner = getattr(env.base_env, name)
+    assert getattr(env, name) == inner != getattr(ConstrainedEnv, name, None)
+
+
 def test_transforms_do_not_share_their_draws():
     exact, noisy = PointMass(4000), PointMass(4000)
     noisy = transformed(noisy, one=SensorNoise(0.3), other=SensorNoise(0.4), seed=0)
     noise = noisy.reset()["observation"] - exact.reset()["observation"]
     assert noise.std().item() == pytest.approx(0.5, rel=0.05)  # shared ones: 0.7
+
+
+class Seeded(ConstraintTransform):
+    def seed(self, seeds):
+        self.seeds = seeds
+
+
+def test_transforms_do_not_get_the_seeds_of_episodes():
+    given = {"first": Seeded(), "second": Seeded()}
+    transformed(PointMass(1), **given, seed=3)
+    episodes = rng.fold(rng.row_seeds(3, 1), torch.arange(100))  # as the environments do
+    assert not any((transform.seeds == episodes).any() for transform in given.values())
 
 
 def test_transforms_of_torchrl_can_stand_among_ours():
@@ -263,6 +324,10 @@ def filtered(function, **keys):
         *(
             (lambda t=t: TransformedEnv(PointMass(1), t).rollout(1), "no cost 'coast'")
             for t in (ObservedCosts(0.5, ["coast"]), EarlyTermination({"coast": 5.0}))
+        ),
+        *(
+            (lambda t=t: transformed(PointMass(1), t=t), r"t: There is no cost 'coast'")
+            for t in (EarlyTermination({"coast": 5.0}), Saute({"coast": 5.0}, **SAUTE))
         ),
         *(
             (lambda key=key: filtered(half_speed, cost_key=key), f"f: cost_key={key}: choose anot")

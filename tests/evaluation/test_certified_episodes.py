@@ -127,4 +127,7 @@ def test_what_an_episode_can_cost_is_known_from_the_environment():
     assert PointMass(2, 20).highest_cost("cost") == math.inf
     stop = {"_target_": "safe_rl.envs.transforms.EarlyTermination", "budgets": {"cost": 4.0}}
     assert highest(transforms={"stop": stop}, evaluating=True) == 30.0
-    assert highest(transforms={"stop": {**stop, "in_evaluation": True}}, evaluating=True) == 5.0
+    ends = {"stop": {**stop, "in_evaluation": True}}
+    assert highest(transforms=ends, evaluating=True) == 5.0
+    held = {"hold": {"_target_": "safe_rl.envs.transforms.ActionRepeat", "k": 4}}
+    assert highest(transforms=ends | held, evaluating=True) == 5.0
