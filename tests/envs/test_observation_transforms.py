@@ -72,7 +72,6 @@ def test_pictures_have_no_noise_and_no_room_for_budgets():
     film = from_gymnasium(Film, num_envs=2, cost_keys=["cost"], num_steps=4, flatten=False)
     env = transformed(film, noise=SensorNoise(30.0))
     check_env_specs(env)
-    assert env.observation_spec == film.observation_spec
     assert (env.rollout(6, break_when_any_done=False)["observation"] == 100).all()
     with pytest.raises(ValueError, match="not a dictionary or a picture"):
         check_constrained_env(transformed(film, saute=Saute({"cost": 2.0}, **SAUTE)))
