@@ -215,7 +215,7 @@ def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():
     shield = "transforms.action_filter.filter"
     with pytest.raises(ValueError, match=rf"no key '{shield}.lead'\. .*added: '\+{shield}.lead=…'"):
         composed("transforms=[action_filter]", f"{shield}._target_=my.shield", f"{shield}.lead=1")
-    with pytest.raises(ValueError, match=r"argument of .*SACLoss is added: '\+loss\.target_entropy"):
+    with pytest.raises(ValueError, match=r"of .*SACLoss is added: '\+loss\.target_entropy"):
         composed("algo=sac", "loss.target_entropy=-1")
     with pytest.raises(ValueError, match=r"Did you mean 'loss\.clip_epsilon'"):
         composed("loss._target_=safe_rl.objectives.PPOLoss", "loss.clip_epsilonn=3")
