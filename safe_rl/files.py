@@ -12,6 +12,7 @@ import os
 import re
 import secrets
 import stat
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -281,3 +282,12 @@ def check_place(path: Path, otherwise: str) -> None:
         raise NotADirectoryError(f"{path} cannot be written: {above} is no folder. {otherwise}")
     if not os.access(above, os.W_OK | os.X_OK):
         raise PermissionError(f"{path} cannot be written: {above} is read-only. {otherwise}")
+
+
+def print_line(line: object) -> None:
+    """Print a line, unless nobody reads it: a closed terminal, or `| head`, ends no command."""
+    try:
+        print(line, flush=True)
+    except OSError:
+        # Python would flush the buffered line again at exit, and change the exit status
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115

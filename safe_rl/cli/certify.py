@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from safe_rl.cli.options import run_command
 from safe_rl.evaluation.settings import CertifyOptions
+from safe_rl.files import print_line
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
 
@@ -29,5 +30,5 @@ def carry_out(words: list[str], options: CertifyOptions, modules: list[str] | No
         changes=options.certificate,
         deterministic=options.deterministic,
     )
-    print(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
+    print_line(certificate or "Nothing to certify: the run has no limits, or no checkpoints.")
     return 0 if certificate is not None and certificate.checkpoint is not None else 1

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from safe_rl.cli.options import run_command
 from safe_rl.evaluation.settings import EvaluationOptions
+from safe_rl.files import print_line
 from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
 
@@ -23,5 +24,5 @@ def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] |
     directory = find_run(words[0])
     check_imports(Run(directory).config, modules, directory)
     import_modules(modules)
-    print(evaluate(directory, options, progress=True))
+    print_line(evaluate(directory, options, progress=True))
     return 0

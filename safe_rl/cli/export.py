@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from safe_rl.checks import CheckedOptions, SettingError, option
 from safe_rl.cli.options import run_command
+from safe_rl.files import print_line
 from safe_rl.trust import check_imports, import_modules
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
             n for n, node in nodes if not str(node.get("_target_")).endswith(".ActionScaling")
         )
         if names := ", ".join(others):
-            print(
+            print_line(
                 f"The file has the policy without the transforms {names}: your program has to do "
                 "what they do (see its metadata), and a certificate is about both together."
             )
@@ -68,7 +69,7 @@ def export(words: list[str], options: ExportOptions, modules: list[str] | None) 
         raise SettingError("actions: it is that of FILE.onnx. A FOLDER has the policy itself.")
     else:
         pack_policy(run.directory, target, which)
-    print(f"wrote {target}")
+    print_line(f"wrote {target}")
     return 0
 
 

@@ -35,7 +35,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from safe_rl.checks import SettingError
-from safe_rl.files import printable
+from safe_rl.files import print_line, printable
 from safe_rl.naming import did_you_mean
 
 if TYPE_CHECKING:
@@ -192,17 +192,12 @@ def run_command(
     words = sys.argv[1:] if arguments is None else list(arguments)
     is_help = words[:1] in (["-h"], ["--help"])
     modules, words = split_imports(words)
+    if is_help or len(words) < len(places):
+        print_line(usage(" ".join([program, *places]), schema))
+        return 0 if is_help else 2
     try:
-        if is_help or len(words) < len(places):
-            print(usage(" ".join([program, *places]), schema), flush=True)
-            return 0 if is_help else 2
         number = len(places)
-        status = work(words[:number], read_options(words[number:], schema), modules)
-        sys.stdout.flush()  # at exit Python would say that a pipe is closed
-        return status
-    except BrokenPipeError:  # nobody reads the rest, as in `| head`
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
-        return 1
+        return work(words[:number], read_options(words[number:], schema), modules)
     except _EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from safe_rl.cli.options import run_command
 from safe_rl.envs import SUITE, env_node, resolve
-from safe_rl.files import check_place, printable
+from safe_rl.files import check_place, print_line, printable
 from safe_rl.reporting import Report, ReportOptions, build_report, write_report
 from safe_rl.reporting.archive import archive_runs
 from safe_rl.reporting.tables import clean
@@ -54,8 +54,8 @@ def carry_out(words: list[str], options: ReportOptions, modules: list[str] | Non
     root = Path(words[0])
     result, page = report(root, options)
     if options.archive is not None:
-        print(f"kept {len(result.runs)} runs in {options.archive}")
+        print_line(f"kept {len(result.runs)} runs in {options.archive}")
     for path, reason in result.skipped.items():
         print(f"left out {clean(path)}: {printable(reason)}", file=sys.stderr)
-    print(f"wrote {page}")
+    print_line(f"wrote {page}")
     return 0

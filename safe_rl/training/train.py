@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
@@ -29,7 +28,7 @@ from safe_rl.evaluation.certificate import has_options
 from safe_rl.evaluation.certifying import certify_run
 from safe_rl.evaluation.loading import keep_robot, robot_of
 from safe_rl.evaluation.settings import certificate_options, has_tested_measure
-from safe_rl.files import PROGRAM, replacing
+from safe_rl.files import PROGRAM, print_line, replacing
 from safe_rl.runs.checkpoints import is_finished
 from safe_rl.runs.folder import RunInUseError, checkpoint_steps, lock_folder
 from safe_rl.runs.identity import is_to_keep_limits, measure_of, whole_frames
@@ -328,12 +327,3 @@ def end_by(signal: Signals | None, line: str) -> None:
     if signal is not None:
         print_line(line)
         raise SystemExit(128 + signal)
-
-
-def print_line(line: str) -> None:
-    """Print a line, unless the terminal was closed; that may have ended the run."""
-    try:
-        print(line, flush=True)
-    except OSError:
-        # Python would flush the buffered line again at exit, and change the exit status
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
