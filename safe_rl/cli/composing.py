@@ -221,7 +221,7 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
         named = [name for name in known if "._" not in name]
         known = [] if key.endswith("._target_") else named
         hint = f"What a class of yours takes is added: '+{key}=…'."
-    elif (name := key.rpartition(".")[2]) in _arguments_of(target):
+    elif not is_swept and key.rpartition(".")[2] in _arguments_of(target):
         known, hint = [], f"This argument of {target} is added: '+{key}=…'."
     return unknown_key(key, known, hint)
 

@@ -139,10 +139,12 @@ class CheckedSteps(gymnasium.Wrapper):
         return observation, self._number("the reward", reward), terminated, truncated, info
 
     def _tell_uncounted(self, info: dict[str, Any]) -> None:
-        kept = " 'cost' is taken as the environment gives it." if COST in self._cost_keys else ""
         known = (*self._cost_keys, *self._told)
         for key in [key for key in info if is_cost(key) and key not in known]:
             self._told.append(key)
+            kept = (
+                " 'cost' is taken as the environment gives it." if COST in self._cost_keys else ""
+            )
             warnings.warn(
                 # without the step, which differs among rows: Python shows equal warnings once
                 f"info['{key}'] is not counted as a cost, because it is not in "
