@@ -64,7 +64,9 @@ def normalise_advantages(
     samples = ... if mask is None else mask
     reward, costs = require(tensordict, advantage), tensordict.get(cost_advantage, None)
     centred, scaled = reward[samples] - reward[samples].mean(), torch.zeros_like(reward)
-    scaled[samples] = centred / centred.square().mean().sqrt().clamp_min(1e-8)
+    # what is left of a constant is rounding, which is relative to its size
+    rounding = (1e-6 * reward[samples].abs().max()).clamp_min(1e-8)
+    scaled[samples] = centred / torch.maximum(centred.square().mean().sqrt(), rounding)
     tensordict.set(advantage, scaled)
     if costs is not None:
         shifted = torch.zeros_like(costs)

@@ -283,6 +283,9 @@ def test_nodes_are_built_and_their_keys_named():
     wrong = {**node, "filter": {"_target_": "transforming.half_spe", "_partial_": True}}
     with pytest.raises(TargetError, match=r"transforms\.slow\.filter\._target_=.*half_spe"):
         make_env({"robot_base": "point"}, transforms={"slow": wrong})
+    misspelt = {**node, "filter": {**node["filter"], "sped": 0.1}}
+    with pytest.raises(ValueError, match=r"^transforms\.slow: .*unexpected .*'sped'"):
+        make_env({"robot_base": "point"}, transforms={"slow": misspelt})
     late = {"_target_": "safe_rl.envs.transforms.ActionDelay", "steps": -1}
     with pytest.raises(ValueError, match=r"^transforms\.late\.steps=-1: it must be"):
         make_env("PointGoal1", transforms={"late": late})

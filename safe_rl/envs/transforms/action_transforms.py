@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from inspect import signature
 from typing import Annotated, Any
 
@@ -19,8 +20,13 @@ from safe_rl.naming import STEPS_TAKEN
 
 
 def _parameters(function: Callable[..., Any]) -> set[str]:
-    """Names of parameters; empty for a function without a signature, such as `torch.clamp`."""
+    """Names of parameters; empty for a function without a signature, such as `torch.clamp`.
+
+    TypeError if an argument that it already has (`functools.partial`) is none of them.
+    """
     try:
+        if isinstance(function, partial):
+            signature(function.func).bind_partial(*function.args, **function.keywords)
         return set(signature(function).parameters)
     except ValueError:
         return set()
@@ -45,6 +51,7 @@ class ActionFilter(ConstraintTransform):
         cost_key: Name of the cost of interventions.
 
     Raises:
+        TypeError: If the function does not take an argument that it was given beforehand.
         ConfigError: At a step, if the function returns another shape or type, or has a parameter
             `positions` and the environment has no positions.
 
