@@ -41,7 +41,7 @@ class Resumable:
         """Restore what `state_dict` has returned.
 
         Raises:
-            ValueError: If a value is missing, or of another kind or shape than the attribute.
+            ValueError: If a value is missing, or a tensor has another shape than the attribute.
         """
         for name in self.state_names:
             current = getattr(self, name)
@@ -76,35 +76,17 @@ def _restored(name: str, current: Any, saved: Any) -> Any:
         return {key: _restored(f"{name}.{key}", part, entry) for key, part, entry in entries}
     if isinstance(current, torch.Generator):
         current.set_state(saved.cpu())
-    elif isinstance(current, torch.optim.Optimizer):
-        load_optimizer(current, saved)
     elif hasattr(current, "load_state_dict"):
         current.load_state_dict(saved)
-    elif isinstance(current, int | float | list) and type(saved) is not type(current):
-        raise ValueError(f"'{name}' is {str(saved)[:40]!r}, expected a {type(current).__name__}.")
     else:
         return saved
     return current
 
 
 def _check_shape(name: str, current: Tensor, saved: Any) -> None:
-    """Refuse what is no tensor of the shape of `own`; where `own` is empty, any length fits."""
+    """Refuse what is no tensor of the shape of `current`; where it is empty, any length fits."""
     shape = tuple(saved.shape) if isinstance(saved, Tensor) else None
     lengths = zip(shape or (), current.shape, strict=False)
     if shape is None or len(shape) != current.ndim or any(n != m and m for n, m in lengths):
         kind = f"a {type(saved).__name__}" if shape is None else f"of the shape {list(shape)}"
         raise ValueError(f"'{name}' is {kind}, expected the shape {list(current.shape)}.")
-
-
-def load_optimizer(optimizer: torch.optim.Optimizer, state_dict: Any) -> None:
-    """Restore an optimiser; a ValueError refuses moments of other shapes than their parameters.
-
-    Torch does not compare them, so the first step would fail instead.
-    """
-    optimizer.load_state_dict(state_dict)
-    if not isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW | torch.optim.SGD):
-        return  # others may have moments of any shape
-    for parameter, moments in optimizer.state.items():
-        for name, moment in moments.items():
-            if isinstance(moment, Tensor) and moment.ndim:
-                _check_shape(name, parameter, moment)

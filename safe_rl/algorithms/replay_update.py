@@ -22,7 +22,6 @@ from safe_rl.algorithms.replay_buffer import Memory
 from safe_rl.checks import Checked
 from safe_rl.naming import did_you_mean
 from safe_rl.objectives.q_functions import ReplayLoss
-from safe_rl.resumable import load_optimizer
 
 _NO_GRAPH = (
     "If the loss reads numbers on the host (.item()) or branches on them (if), its gradient steps "
@@ -212,7 +211,7 @@ class ReplayUpdate(Checked):
         stored["param_groups"] = [
             {**group, "capturable": self._uses_graphs} for group in stored["param_groups"]
         ]
-        load_optimizer(self.optimizer, stored)
+        self.optimizer.load_state_dict(stored)
         self._prepare_steps()  # earlier graphs would use the optimiser's earlier tensors
         stored = state_dict["loss"]
         for name, tensor in self._tensors():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from safe_rl.algorithms.algorithm_contract import Stateful, states_of
@@ -44,7 +44,7 @@ class CheckpointSelection(Resumable):
         longest: Largest length of an episode, used as the mean length until an episode has ended.
 
     Attributes:
-        waiting: The policies: ``steps`` and ``epoch`` of the run then, and ``states`` by name.
+        waiting: The policies: ``steps`` of the run then, and ``states`` by name.
     """
 
     state_names = ("waiting",)
@@ -63,16 +63,6 @@ class CheckpointSelection(Resumable):
         self._latest: deque[Mapping[str, float]] = deque(maxlen=over)
         self.waiting: list[dict[str, Any]] = []
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the waiting policies; ValueError if one lacks its steps, epoch or states."""
-        super().load_state_dict(state_dict)
-        kinds = {"steps": int, "epoch": int, "states": dict}
-        for policy in self.waiting:
-            if not isinstance(policy, dict) or {k: type(v) for k, v in policy.items()} != kinds:
-                raise ValueError(
-                    "a waiting policy must have whole 'steps' and 'epoch', and 'states'."
-                )
-
     def add(self, row: Mapping[str, float]) -> list[dict[str, Any]]:
         """Add an epoch, a row of the table, and score the waiting policy whose epochs are complete.
 
@@ -82,11 +72,11 @@ class CheckpointSelection(Resumable):
         """
         self.take(row)
         states = copy.deepcopy(states_of(self._components))
-        self.waiting.append({"steps": row["steps"], "epoch": row["epoch"], "states": states})
+        self.waiting.append({"steps": row["steps"], "states": states})
         delay = epochs_until_scored(self._over, self._length, self._steps_per_epoch)
-        due = len(self.waiting) - delay
-        passed = [self.waiting.pop(0) for _ in range(due)]
-        return self._score(passed[-1]) if passed else []
+        due = max(0, len(self.waiting) - delay)
+        passed, self.waiting = self.waiting[:due], self.waiting[due:]
+        return self._score(passed[-1:])
 
     def take(self, row: Mapping[str, float]) -> None:
         """Add an epoch of a run that is resumed, from which no policy waits."""
@@ -99,10 +89,10 @@ class CheckpointSelection(Resumable):
 
         They keep waiting, because a resumed run has later epochs to score them by.
         """
-        return [scored for policy in self.waiting for scored in self._score(policy)]
+        return self._score(self.waiting)
 
-    def _score(self, policy: Mapping[str, Any]) -> list[dict[str, Any]]:
+    def _score(self, policies: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         score = feasible_return(self._latest, self._limits)
         if score is None:
             return []
-        return [{"steps": policy["steps"], "score": score, "states": policy["states"]}]
+        return [{"steps": p["steps"], "score": score, "states": p["states"]} for p in policies]

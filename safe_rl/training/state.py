@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import threading
@@ -30,12 +29,6 @@ class Progress(Resumable):
     epoch: int = 0
     steps: int = 0
     seconds: float = 0.0
-
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore the counters; ValueError unless they are numbers from 0 on."""
-        super().load_state_dict(state_dict)
-        if not all(0 <= n < math.inf for n in (self.epoch, self.steps, self.seconds)):
-            raise ValueError("its counters must be finite and not below 0.")
 
 
 class RandomGenerators(GlobalRNGState):

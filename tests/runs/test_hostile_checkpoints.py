@@ -82,16 +82,9 @@ def test_transitions_of_another_kind_are_refused_in_a_line(edit, words, off_poli
     assert str(caught.value).isprintable()
 
 
-def moments(state):
-    return state["optimizer"]["state"][0]
-
-
 @pytest.mark.parametrize(
     ("part", "edit", "words"),
     [
-        ("progress", lambda state: state.update(steps="many"), "'steps' is 'many'"),
-        ("progress", lambda state: state.update(steps=-1), "not below 0"),
-        ("progress", lambda state: state.update(seconds=math.nan), "must be finite"),
         ("progress", dict.clear, "there is no 'epoch'"),
         ("accounting", lambda state: state["totals"].fill_(math.nan), "must be finite"),
         ("accounting", lambda state: state["totals"].neg_(), "not below 0"),
@@ -99,9 +92,6 @@ def moments(state):
         ("accounting", lambda state: state.update(totals=[1.0]), "'totals' is a list"),
         ("accounting", lambda state: state.update(open_sums=torch.ones(9, 3)), "of the shape"),
         ("policy_update", lambda state: state.update(optimizer=[]), ""),
-        ("policy_update", lambda state: moments(state).update(exp_avg=torch.ones(9)), "'exp_avg'"),
-        ("candidates", lambda state: state.update(waiting=[3]), "a waiting policy must"),
-        ("candidates", lambda state: state.update(waiting={}), "'waiting' is"),
         ("algorithm", lambda state: state.update(tracker=[]), "there is no 'costs'"),
         ("actor", lambda state: state.update({"\x1b[31m": torch.ones(1)}), r"\?\[31m"),
     ],
