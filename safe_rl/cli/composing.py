@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
-from threading import RLock
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -23,7 +22,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from safe_rl.checks import parameters_of
 from safe_rl.cli.config import General, keys_of, unknown_key
 from safe_rl.cli.folders import name_choices
 from safe_rl.cli.options import first_line, unreadable
@@ -31,16 +29,14 @@ from safe_rl.envs import store_configs
 from safe_rl.envs.families import hint_of_gymnasium
 from safe_rl.extras import hint_of_plugin
 from safe_rl.files import CONF, PROGRAM
-from safe_rl.naming import did_you_mean, nearest
+from safe_rl.naming import did_you_mean
 from safe_rl.runs.identity import RESUMABLE, differences, flatten
 from safe_rl.runs.run import Run
-from safe_rl.trust import check_imports, locate
+from safe_rl.trust import check_imports
 
 _MOST_LISTED = 40
 RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
-COMPOSING = RLock()
-"""Held while Hydra composes: its state and its ConfigStore are those of the process."""
 COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
     *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
@@ -78,7 +74,7 @@ def compose_run(
     `words` are overrides, `folders` those of ``--config-dir``, `name` is the primary configuration.
 
     Raises:
-        ValueError: If a folder does not exist, or Hydra refuses a word or a file, in one line.
+        ValueError: If Hydra refuses a word or a file, in one line.
 
     Examples:
         >>> compose_run(["env=CarGoal1", "seed=3"]).seed
@@ -86,9 +82,6 @@ def compose_run(
     """
     store_configs()
     places = [Path(folder).expanduser().absolute() for folder in folders]
-    for place in places:
-        if not place.is_dir():
-            raise ValueError(f"config_dir={place}: there is no such folder.")
     searched = {"hydra.searchpath": [f"file://{place}" for place in places]} if places else {}
     words = [*overrides_of(searched), *words]
     try:
@@ -101,14 +94,13 @@ def compose_run(
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
     # an application of the user's may be on Hydra too, and call `safe_rl.train`
-    with COMPOSING:
-        outside = GlobalHydra.instance().hydra
-        GlobalHydra.instance().clear()
-        try:
-            with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
-                return compose(name, list(words), return_hydra_config=True)
-        finally:
-            GlobalHydra.instance().hydra = outside
+    outside = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
+            return compose(name, list(words), return_hydra_config=True)
+    finally:
+        GlobalHydra.instance().hydra = outside
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -160,7 +152,7 @@ def explain(error: Exception, words: Sequence[str]) -> str:
     cause = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     unknown = re.match(r"Could not override '([^']+)'\.", text)
     if unknown and cause is not error:
-        return _unknown_key(cause, words)
+        return _unknown_key(cause)
     if unknown and "No match in the defaults list" in text:
         if f"--config-name={RESUMED}" in words:
             return f"{unknown[1]}: a continued run keeps its {unknown[1]}."
@@ -183,18 +175,16 @@ def _unknown_choice(
     known, place = options or _choices(group), f"{file}: " if file else ""
     if file and not known:
         return f"{place}there is no {group}. In 'defaults' write /{Path(group).name}: {name}."
-    if name in known:
-        return f"{place}there is no '{name}': --config-path replaces conf/, --config-dir adds."
     listed = f"There are {', '.join(known)}"
     if len(known) > _MOST_LISTED:
         listed = f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
-    hint = hint or did_you_mean("none" if name == "null" else name, known, 0.6)
+    hint = hint or did_you_mean(name, known, 0.6)
     more = f" {listed}; a file of yours needs --config-dir FOLDER, a module import=FILE.py."
     return f"{place}there is no {group} '{name}'.{hint or more}"
 
 
-def _unknown_key(error: Any, words: Sequence[str]) -> str:
+def _unknown_key(error: Any) -> str:
     """A message about a key that the configuration, which OmegaConf's error has, does not have."""
     key, config = str(error.full_key), error.parent_node._get_root()
     section, known = key.partition(".")[0], keys_of(config)
@@ -205,33 +195,9 @@ def _unknown_key(error: Any, words: Sequence[str]) -> str:
         given = config.get("cost_limits") not in ("default", {})  # {}: made to hold this key
         added = f" To add this one to those of a file: +{key}=…" if given else ""
         return f"{key}: limits are given together, cost_limits='{example}'.{added}"
-    is_swept = any(re.match("algo=.*,", word) for word in words)
-    part = config.get(section)
-    if part == {} and section != "transforms" and not is_swept:  # made to hold this key
-        return f"this algorithm has no '{section}'."
-    hint = f"If only swept algorithms have it, write '++{key}=…'." if is_swept else ""
-    node = error.parent_node
-    target = str(node.get("_target_")) if OmegaConf.is_dict(node) else "None"
-    if section == "env" and "kwargs" in part:
-        name = key.removeprefix("env.").removeprefix("kwargs.")
-        known = [f"env.{other}" for other in part if nearest(name, [str(other)], 0.7)]
-        arguments = f"Arguments of its constructor are given as env.kwargs='{{{name}: …}}'."
-        hint = "" if known else arguments
-    elif key.endswith("._target_") or not target.startswith(("safe_rl.", "None")):
-        named = [name for name in known if "._" not in name]
-        known = [] if key.endswith("._target_") else named
-        hint = f"What a class of yours takes is added: '+{key}=…'."
-    elif not is_swept and key.rpartition(".")[2] in _arguments_of(target):
-        known, hint = [], f"This argument of {target} is added: '+{key}=…'."
-    return unknown_key(key, known, hint)
-
-
-def _arguments_of(target: str) -> Collection[str]:
-    """Names of the arguments of a target; none if there is no such target."""
-    try:
-        return parameters_of(locate(target))
-    except ValueError:
-        return ()
+    if config.get(section) == {} and section != "transforms":  # made to hold this key
+        return f"this algorithm has no '{section}'. If another one of a sweep has it: '++{key}=…'."
+    return unknown_key(key, known)
 
 
 def read_resumed(

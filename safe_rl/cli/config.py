@@ -8,7 +8,6 @@ by the parts' constructors; an environment checks its own.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -220,11 +219,6 @@ def check_settings(config: DictConfig) -> None:
         _check(General, config, "")
         _check(Algo, config.algo, "algo", is_open=True)
         _check(CertificateOptions, config.certificate, "certificate")
-        for name in {"tail", "deterministic"} & {*config.certificate}:
-            raise SettingError(
-                f"certificate.{name}: leave it out. The tail is the risk's (risk=cvar "
-                "risk.tail=…), and a run is certified with sampled actions."
-            )
         if not OmegaConf.is_dict(config.model) or "_target_" not in config.model:
             _check(Model, config.model, "model")
         check_value("env.name", Folder, config.env.name)
@@ -255,11 +249,6 @@ def _check_together(config: DictConfig) -> None:
 
 def _check_parts(config: DictConfig) -> None:
     """Refuse what a preset or a command has added to an algorithm without such a part."""
-    updates = (config.get(name) or {} for name in ("policy_update", "critic_update"))
-    if config.get("compile") and not any("compile" in update for update in updates):
-        warnings.warn(
-            f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
-        )
     # an algorithm of the user's own may do without some of them
     is_of_package = str(config.algo.get("_target_")).startswith("safe_rl.")
     if is_of_package and (misplaced := General.__annotations__.keys() & config.algo.keys()):
@@ -305,12 +294,12 @@ def _check(section: type, values: Any, above: str, *, is_open: bool = False) -> 
 
 
 def keys_of(config: DictConfig) -> list[str]:
-    """Full keys of all values of a configuration."""
+    """Full keys of all values of a configuration, but those such as ``_target_``."""
     plain: Any = OmegaConf.to_container(config)
-    return [key for key in flatten(plain) if not key.startswith("hydra.")]
+    return [key for key in flatten(plain) if not key.startswith("hydra.") and "._" not in key]
 
 
-def unknown_key(key: str, known: Iterable[str], hint: str = "") -> str:
+def unknown_key(key: str, known: Iterable[str]) -> str:
     """A message that a key does not exist; it names keys with the same end, or the nearest one.
 
     Examples:
@@ -322,6 +311,9 @@ def unknown_key(key: str, known: Iterable[str], hint: str = "") -> str:
     known = [path for path in known if path != key]
     same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
     names = " or ".join(f"'{path}'" for path in same or filter(None, [nearest(key, known, 0.7)]))
-    meant = f" Did you mean {names}?" if names else ""
-    hint = hint if hint or meant else "'--cfg job' prints all of this algorithm and environment."
-    return f"there is no key '{key}'.{meant}{hint and f' {hint}'}"
+    if names:
+        return f"there is no key '{key}'. Did you mean {names}?"
+    return (
+        f"there is no key '{key}'. '--cfg job' prints all of this algorithm and environment. One "
+        f"that a class of yours takes, or another algorithm of a sweep, is added: '++{key}=…'."
+    )

@@ -21,7 +21,6 @@ from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
 from safe_rl.cli.composing import (
-    COMPOSING,
     RESUMED,
     compose_run,
     overrides_of,
@@ -95,19 +94,11 @@ def train(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
-    if "resume" in settings:
-        raise ValueError("safe_rl.resume(directory) continues a run.")
-    if "import" in settings:
-        raise ValueError("import: in Python imports=… names the modules.")
-    if directory == "":
-        raise ValueError("directory=… names the folder of the run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = [imports] if isinstance(imports, str) else list(imports)
     import_modules(modules)
     more = {"import": modules} if modules else {}
     config = compose_run([f"env={env}", f"algo={algo}", *overrides_of(settings | more)], folders)
-    if any(word.lstrip("+~").startswith("hydra.run") for word in config.hydra.overrides.hydra):
-        raise ValueError("hydra.run.dir: in Python directory=… names the folder of the run.")
     check_settings(config)
     folder = new_folder(Path(config.hydra.run.dir)) if directory is None else directory
     return _carry_out(config, Path(folder).expanduser(), callbacks)
@@ -145,9 +136,8 @@ def resume(
     modules = [imports] if isinstance(imports, str) else imports
     import_modules(modules)
     words = list(overrides_of(settings))
-    with COMPOSING:
-        ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
-        config = compose_run(words, name=RESUMED)
+    ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
+    config = compose_run(words, name=RESUMED)
     refuse_changes(folder.absolute(), config)
     check_settings(config)
     return _carry_out(config, folder, callbacks, continues=True)

@@ -99,13 +99,7 @@ def common_source(source: str) -> str:
 
 
 def new_folder(wanted: Path) -> Path:
-    """Make the folder of a new run; if it exists, its name gets a number.
-
-    Raises:
-        ValueError: If the path is empty.
-    """
-    if wanted == Path():
-        raise ValueError("hydra.run.dir is empty: it names the folder of the run.")
+    """Make the folder of a new run; if it exists, its name gets a number."""
     wanted = wanted.expanduser().absolute()
     for number in count(1):
         path = wanted if number == 1 else wanted.with_name(f"{wanted.name}_{number}")
