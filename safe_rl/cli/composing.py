@@ -179,7 +179,7 @@ def _unknown_choice(
     if len(known) > _MOST_LISTED:
         listed = f"'{PROGRAM} --help' names all"
     hint = hint_of_gymnasium(name) if group == "env" else hint_of_plugin(f"{group}={name}")
-    hint = hint or did_you_mean(name, known, 0.6)
+    hint = hint or did_you_mean("none" if name == "null" else name, known, 0.6)
     more = f" {listed}; a file of yours needs --config-dir FOLDER, a module import=FILE.py."
     return f"{place}there is no {group} '{name}'.{hint or more}"
 
@@ -190,7 +190,7 @@ def _unknown_key(error: Any) -> str:
     section, known = key.partition(".")[0], keys_of(config)
     if section == key:  # the whole section may be wrong, as in los.clip_epsilon=0.1
         known += map(str, config)
-    if section == "cost_limits":
+    if section == "cost_limits" or key.startswith("limits.cost"):
         example = f"{{{key.partition('.')[2]}: 10}}"
         given = config.get("cost_limits") not in ("default", {})  # {}: made to hold this key
         added = f" To add this one to those of a file: +{key}=…" if given else ""
@@ -232,8 +232,9 @@ def read_resumed(
     if modules is not None:
         config["import"] = list(modules)
     for name in ("policy_update", "critic_update"):
-        part = config.get(name) or {}
-        if part.get("compile", "") == config.get("compile"):  # they follow it, as in a new run
+        part = config.get(name)
+        # they follow it, as in a new run
+        if isinstance(part, dict) and part.get("compile", "") == config.get("compile"):
             config[name] = {**part, "compile": "${compile}"}
     if any(re.match(r"logger='?\w", word) for word in words):
         config.pop("logger", None)  # keys of another logger would stay

@@ -260,9 +260,17 @@ def _check_parts(config: DictConfig) -> None:
         part = config.get(name, "absent")
         if part is None or (OmegaConf.is_dict(part) and part.get("_target_", "") is None):
             raise SettingError(f"{name}=null: the {name} of an algorithm cannot be left out.")
-    for name in _PARTS:
+    for name in ("loss", "policy_update", *_PARTS):
         part = config.get(name)
-        if part is not None and not (OmegaConf.is_dict(part) and "_target_" in part):
+        if part is None:
+            continue
+        if not OmegaConf.is_dict(part):
+            hint = " Limits are given as cost_limits='{cost: 25}'." if name == "limits" else ""
+            raise SettingError(
+                f"{name}={part}: '{name}' is a section; its keys, which '--cfg job' prints, are "
+                f"given one by one, {name}.<key>=….{hint}"
+            )
+        if "_target_" not in part:
             words = "" if config.preset in ("default", "paper") else f"preset={config.preset}: "
             hint = " For a replay buffer use algo=sac_lagrangian." if name == "memory" else ""
             raise SettingError(f"{words}algo={config.algo.name} has no '{name}'.{hint}")

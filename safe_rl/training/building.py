@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -28,7 +28,7 @@ from safe_rl.collectors.workers import MakeEnv
 from safe_rl.envs import make_env
 from safe_rl.evaluation.episodes import default_seed, has_fixed_layout, periodic_evaluation
 from safe_rl.evaluation.loading import robot_of, transforms_of
-from safe_rl.runs.checkpoints import CheckpointStore, check_interface
+from safe_rl.runs.checkpoints import CheckpointStore, check_interface, read_facts
 from safe_rl.runs.folder import run_of
 from safe_rl.runs.run import Run
 from safe_rl.runs.writing import RunWriter
@@ -133,6 +133,17 @@ def _build_collector(
     return instantiate(config.collector, env=env, make_env=make_env, **given)
 
 
+def _other_actions(known: Any, here: Mapping[str, Any]) -> Iterator[str]:
+    """Warnings if actions meant something else where a policy was trained, by two `interface`s."""
+    key, known = "steps_per_decision", known if isinstance(known, dict) else {}
+    if known.get(key, here[key]) != here[key]:
+        yield f"Warning: an action of init_from lasts {known[key]} step(s), and here {here[key]}."
+    both = (known.get("actions"), here["actions"])
+    bounds = [[a.get("own_low"), a.get("own_high")] for a in both if isinstance(a, dict)]
+    if len(bounds) == 2 and bounds[0] != bounds[1]:
+        yield f"Warning: actions of init_from have the bounds {bounds[0]}, and here {bounds[1]}."
+
+
 def begin_from(
     algorithm: Algorithm, config: Mapping[str, Any], interface: Mapping[str, Any] | None = None
 ) -> list[str]:
@@ -163,6 +174,8 @@ def begin_from(
         )
     if interface is not None:
         check_interface(checkpoint, interface)
+        for warning in _other_actions(read_facts(checkpoint).get("interface"), interface):
+            print(warning)
     run = Run(run_of(checkpoint)[0])
     same_costs = estimated(config) == estimated(run.settings if run.is_run else {})
     taken = {

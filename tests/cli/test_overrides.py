@@ -40,6 +40,10 @@ WRONG = {
     "+evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
     "evaluation.interval=9": r"^evaluation: give both keys at once, evaluation='\{interval: ",
     "cost_limits.cost=10": r"^cost_limits\.cost: limits are .*, cost_limits='\{cost: 10\}'\.$",
+    "limits={cost: 25}": r"^limits\.cost: limits are given together, cost_limits=",
+    "limits=25": r"^limits=25: 'limits' is a section.* cost_limits='\{cost: 25\}'\.$",
+    "loss=sac": r"^loss=sac: 'loss' is a section; its keys, .* one by one, loss\.<key>=…\.$",
+    "logger=null": r"no logger 'null'\. Did you mean 'none'",
     "logger@mine=none": r"^Could not override 'logger@mine'\. Did you mean to override logger\?",
     "slate=SG7": "Unknown slate 'SG7'",
     "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
@@ -127,7 +131,7 @@ def test_an_algorithm_has_the_name_of_its_choice():
         ("paper/cpo", "preset=gpu", "^preset=gpu: algo=cpo has no 'limits'"),
         ("ppo", "lagrangian=pid", "^this algorithm has no 'lagrangian'"),
         ("sac", "critic_update.num_passes=3", "^this algorithm has no 'critic_update'"),
-        ("cpo", "limits=default", "^algo=cpo has no 'limits'"),
+        ("cpo", "limits=default", "^limits=default: 'limits' is a section"),
     ],
 )
 def test_what_only_other_algorithms_have_is_refused(algo, argument, words):

@@ -106,6 +106,14 @@ def test_only_a_run_can_be_resumed(run):
         composed(f"resume={run}")
 
 
+def test_a_part_that_is_a_word_is_refused(run):
+    config = OmegaConf.load(run / "config.yaml")
+    config.policy_update = "trpo"
+    OmegaConf.save(config, run / "config.yaml")
+    with pytest.raises(ValueError, match=r"policy_update"):
+        resumed(run)
+
+
 def test_modules_that_the_command_imports_are_noted(run, tmp_path):
     (tmp_path / "module_to_resume.py").write_text("")
     module = str(tmp_path / "module_to_resume.py")

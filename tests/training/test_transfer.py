@@ -74,6 +74,20 @@ def test_the_cost_critic_stays_new_where_the_costs_are_others(trained, overrides
     assert take_over(trained, *overrides)[1] == ["actor", "critic"]
 
 
+def test_actions_of_another_meaning_are_told(trained, capsys):
+    here = trained.env.interface
+    other = {**here["actions"], "own_low": [-6.0, -6.0]}
+    fresh = make_fresh(trained).algorithm
+    for changes in ({}, {"steps_per_decision": 2}, {"actions": other}):
+        begin_from(fresh, {"init_from": trained.writer.run.directory}, here | changes)
+    told = capsys.readouterr().out.splitlines()
+    assert told == [
+        "Warning: an action of init_from lasts 1 step(s), and here 2.",
+        "Warning: actions of init_from have the bounds [[-1.0, -1.0], [1.0, 1.0]], and here "
+        "[[-6.0, -6.0], [1.0, 1.0]].",
+    ]
+
+
 def test_the_cost_critic_stays_new_with_another_risk_measure(trained):
     risk, source = {"_target_": "safe_rl.objectives.CVaR"}, trained.writer.run.directory
     fresh = make_fresh(trained).algorithm
