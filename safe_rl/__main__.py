@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int | str:
     """Run a command with the rest of the command line; return its exit status."""
     name, *others = [*(sys.argv[1:] if arguments is None else arguments), ""]
     if name in COMMANDS:
-        return import_module(f"safe_rl.cli.{name}").main(others[:-1], f"safe-rl {name}")
+        return import_module(f"safe_rl.cli.{name}").main(others[:-1])
     if name in ("", "-h", "--help"):
         print(USAGE)
         return 0 if name else 2

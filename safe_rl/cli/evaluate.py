@@ -11,9 +11,9 @@ from safe_rl.runs.run import Run
 from safe_rl.trust import check_imports, import_modules
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "safe-rl evaluate") -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    return run_command(carry_out, arguments, program, ["RUN_DIR"], EvaluationOptions)
+    return run_command(carry_out, arguments, "safe-rl evaluate RUN_DIR", EvaluationOptions)
 
 
 def carry_out(words: list[str], options: EvaluationOptions, modules: list[str] | None) -> int:

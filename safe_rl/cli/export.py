@@ -30,9 +30,9 @@ class ExportOptions(CheckedOptions):
     )
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "safe-rl export") -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    return run_command(export, arguments, program, ["RUN_DIR", "FILE.onnx|FOLDER"], ExportOptions)
+    return run_command(export, arguments, "safe-rl export RUN_DIR FILE.onnx|FOLDER", ExportOptions)
 
 
 def export(words: list[str], options: ExportOptions, modules: list[str] | None) -> int:

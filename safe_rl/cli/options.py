@@ -172,8 +172,7 @@ def usage(command: str, schema: type[DataclassInstance]) -> str:
 def run_command(
     work: Callable[[list[str], Any, list[str] | None], int],
     arguments: Sequence[str] | None,
-    program: str,
-    places: Sequence[str],
+    call: str,
     schema: type[DataclassInstance],
 ) -> int:
     """Read the arguments of a command, and run it or print its help; return its exit status.
@@ -184,19 +183,19 @@ def run_command(
         work: Function of the positional arguments, the options, and the modules of ``import=`` or
             None; it returns the exit status.
         arguments: The arguments; None: those of the process.
-        program: The command's name.
-        places: Names of its positional arguments, as its help shows them.
+        call: How it is called, such as ``safe-rl evaluate RUN_DIR``; the words after the second
+            are its positional arguments.
         schema: Dataclass of its options.
     """
     keep_streams()
     words = sys.argv[1:] if arguments is None else list(arguments)
     is_help = words[:1] in (["-h"], ["--help"])
     modules, words = split_imports(words)
-    if is_help or len(words) < len(places):
-        print_line(usage(" ".join([program, *places]), schema))
+    number = len(call.split()) - 2
+    if is_help or len(words) < number:
+        print_line(usage(call, schema))
         return 0 if is_help else 2
     try:
-        number = len(places)
         return work(words[:number], read_options(words[number:], schema), modules)
     except _EXPECTED as error:
         if os.environ.get("HYDRA_FULL_ERROR") == "1":

@@ -304,8 +304,7 @@ class Run(RecordedRun):
         """
         node = loading.override_env(self.config, keys)
         seed = default_seed(node, self.config.seed) if seed is None else seed
-        make = loading.for_evaluation(loading.maker_of(self.directory), self.config)
-        return make(node, num_envs=num_envs, seed=seed)
+        return loading.maker_of(self)(node, num_envs=num_envs, seed=seed)
 
     def evaluate(self, **options: Any) -> Evaluation:
         """Run the policy for whole episodes; write the command's files into the folder.

@@ -43,9 +43,9 @@ def report(root: Path, options: ReportOptions) -> tuple[Report, Path]:
     return result, page
 
 
-def main(arguments: Sequence[str] | None = None, program: str = "safe-rl report") -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status."""
-    return run_command(carry_out, arguments, program, ["RUNS_DIR"], ReportOptions)
+    return run_command(carry_out, arguments, "safe-rl report RUNS_DIR", ReportOptions)
 
 
 def carry_out(words: list[str], options: ReportOptions, modules: list[str] | None) -> int:

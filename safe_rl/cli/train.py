@@ -163,7 +163,7 @@ def _main(config: DictConfig) -> float | None:
     return job(config)
 
 
-def main(words: Sequence[str] | None = None, program: str = "") -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Train, as ``python train.py`` does: the command ``safe-rl train``."""
     start(_main, words)
     return 0

@@ -107,7 +107,7 @@ def certify(
     plain = EvaluationOptions(
         device=device, num_threads=num_threads, deterministic=options.deterministic
     )
-    make = make_env or maker_of(directory)
+    make = make_env or maker_of(run)
     evaluations = [PolicyEvaluation(config, path, plain, make) for path in candidates]
     claimed = ("most_over", "cap", "most_beyond", "tail")
     claim = Claim(limits, **{name: getattr(options, name) for name in claimed})

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +48,6 @@ def override_env(config: DictConfig, overrides: Mapping[str, Any]) -> dict[str, 
 def transforms_of(config: DictConfig) -> dict[str, Any]:
     """Configuration of the run's transforms, by name; runs of older versions have none."""
     return OmegaConf.to_container(config.get("transforms") or OmegaConf.create(), resolve=True)  # type: ignore[return-value]
-
-
-def for_evaluation(make_env: Callable[..., EnvBase], config: DictConfig) -> Callable[..., EnvBase]:
-    """`make_env` for evaluations of a run, with the transforms of the run if it has any."""
-    transforms = transforms_of(config)
-    return partial(make_env, transforms=transforms, evaluating=True) if transforms else make_env
 
 
 def keep_robot(run: Run, env: Mapping[str, Any]) -> None:
@@ -104,10 +97,10 @@ def robot_of(run: Run, env: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
     return {**node, "robot_base": str(path)}
 
 
-def maker_of(directory: Path) -> Callable[..., ConstrainedEnv]:
-    """`safe_rl.make_env` for a run's environments, with the robot that it began with."""
-    run = Run(directory)
-    return lambda env, **options: make_env(robot_of(run, env), **options)
+def maker_of(run: Run) -> Callable[..., ConstrainedEnv]:
+    """`safe_rl.make_env` for evaluations of a run, with its robot and its transforms."""
+    given: dict[str, Any] = {"transforms": transforms_of(run.config), "evaluating": True}
+    return lambda node, **options: make_env(robot_of(run, node), **given, **options)
 
 
 def load_policy(

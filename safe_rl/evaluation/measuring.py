@@ -16,9 +16,9 @@ from torchrl.envs import EnvBase
 from safe_rl.algorithms.constraints import check_cost_limits
 from safe_rl.collectors import Recording, StepRecorder
 from safe_rl.evaluation.episodes import Episodes, collect_episodes, default_seed, shared_layouts
-from safe_rl.evaluation.loading import for_evaluation, load_policy, maker_of, override_env
+from safe_rl.evaluation.loading import load_policy, maker_of, override_env
 from safe_rl.evaluation.policies import writable_copy
-from safe_rl.evaluation.settings import EvaluationOptions, check_options
+from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.evaluation.video import check_camera, record_episode, video_format, write_video
 from safe_rl.files import check_no_links, check_place, replace_csv, replace_json
 from safe_rl.runs.checkpoints import hold
@@ -91,7 +91,7 @@ class PolicyEvaluation:
 
     def make(self, num_envs: int, seed: int | None = None, **keys: Any) -> EnvBase:
         """Make environments, with some keys changed."""
-        return for_evaluation(self.make_env, self.config)(
+        return self.make_env(
             {**self.node, **keys}, num_envs=num_envs, device=self.options.device,
             seed=self.seed if seed is None else seed, num_threads=self.options.num_threads,
         )  # fmt: skip
@@ -166,7 +166,7 @@ def evaluate(
         directory: Folder of a run; a policy of the package is copied into the working directory.
         options: What to evaluate.
         make_env: ``make_env(node, num_envs=, device=, seed=, num_threads=)`` makes environments
-            from a run's ``env``; None: `safe_rl.envs.make_env` with the run's own robot.
+            from a run's ``env``; None: those of the run, with its robot and transforms.
         progress: Whether to show a bar.
 
     Raises:
@@ -174,17 +174,15 @@ def evaluate(
         OSError: If results cannot be written, which is checked before any episode.
         CheckpointError: If the checkpoint is damaged, or does not fit the environment.
         ConfigError: If the environment does not accept an override.
-        ValueError: If options exclude or need each other, or the environment cannot
-            be drawn.
+        ValueError: If the environment cannot be drawn.
     """
-    check_options(options)
     directory = writable_copy(directory)
     run = Run(directory)
     config = run.config
     checkpoint = hold(run.find_checkpoint(options.checkpoint))
     changed = config.copy()
     changed.env = override_env(config, options.env)
-    evaluation = PolicyEvaluation(changed, checkpoint, options, make_env or maker_of(directory))
+    evaluation = PolicyEvaluation(changed, checkpoint, options, make_env or maker_of(run))
     # some environments draw pictures only if this key asks for it
     drawing: Any = {"render_mode": "rgb_array"} if "render_mode" in evaluation.node else {}
     summary, table = (run.evaluation_file(options.name, kind) for kind in ("json", "csv"))

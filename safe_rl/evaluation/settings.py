@@ -107,20 +107,6 @@ class CertificateOptions:
     deterministic: bool = False
 
 
-def check_options(options: EvaluationOptions) -> None:
-    """Refuse options that cannot be used together, before any work begins.
-
-    Raises:
-        ValueError: If an option needs another one, or excludes it; the message names it.
-    """
-    films = options.video or options.picture
-    if not films and options.camera != EvaluationOptions.camera:
-        raise ValueError(f"camera={options.camera}: it is the video's: add video=true.")
-    folder = Path(options.picture or "").parent
-    if not folder.is_dir():
-        raise ValueError(f"picture={options.picture}: there is no folder {folder}.")
-
-
 def has_tested_measure(config: DictConfig) -> bool:
     """Whether a certificate can be about what is limited: not a risk measure of the user's own."""
     target = OmegaConf.select(config, "risk._target_")

@@ -142,6 +142,7 @@ def write_video(path: Path, frames: Iterator[np.ndarray], form: VideoFormat) -> 
         ModuleNotFoundError: If the encoder is missing; the message names the extra.
     """
     write = _write_mp4 if path.suffix == ".mp4" else _write_animation
+    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as unfinished:
         write(unfinished, frames, form.frames_per_second)
 

@@ -20,7 +20,6 @@ from safe_rl.cli.options import (
     run_command,
     usage,
 )
-from safe_rl.evaluation import evaluate
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -73,12 +72,6 @@ def test_errors_say_what_to_write(argument, message):
         read_options([argument], EvaluationOptions)
 
 
-def test_options_that_need_others_are_refused_before_anything_is_done(tmp_path):
-    options = read_options(["camera=track"], EvaluationOptions)
-    with pytest.raises(ValueError, match=r"camera=track: it is the video's: add video=true\."):
-        evaluate(tmp_path / "no run at all", options)
-
-
 def test_keywords_may_be_numbers_of_numpy_and_paths():
     given = {"episodes": np.int64(3), "checkpoint": Path("a/b"), "env": {"x": np.array([1.5, 2])}}
     options = make_options(given, EvaluationOptions)
@@ -117,7 +110,7 @@ def test_an_error_cannot_control_the_terminal(capsys):
     def fail(*arguments):
         raise ValueError("a robot named \x1b]0;mine\x07")
 
-    assert run_command(fail, ["run"], "safe-rl evaluate", ["RUN"], EvaluationOptions) == 1
+    assert run_command(fail, ["run"], "safe-rl evaluate RUN", EvaluationOptions) == 1
     assert capsys.readouterr().err == "error: a robot named ?]0;mine?\n"
 
 

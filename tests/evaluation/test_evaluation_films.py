@@ -118,7 +118,7 @@ def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp
         return make_env(*given, **keys)
 
     monkeypatch.setattr(video, "_frame", note)
-    monkeypatch.setattr(measuring, "maker_of", lambda directory: drawing)
+    monkeypatch.setattr(measuring, "maker_of", lambda run: drawing)
     picture = str(tmp_path / "episode.webp")
     changes = {"num_envs": 1, "deterministic": deterministic}
     result = evaluate(run, options(episodes=2, picture=picture, **changes))

@@ -20,7 +20,6 @@ from safe_rl.evaluation.loading import override_env
         (["env.lidar_num_bins=8", "record=true"], "trained on other observations"),
         (["camera=nowhere", "video=true"], "nowhere"),
         (["picture=there.png"], "ending in .gif or .webp"),
-        (["picture=nowhere/there.gif"], "there is no folder nowhere"),
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):

@@ -126,7 +126,7 @@ def test_a_policy_is_certified_without_it(tmp_path):
     made = []
 
     def make_without(node, **others):
-        made.append(maker_of(run.directory)({**node, "observe_privileged": False}, **others))
+        made.append(maker_of(run)({**node, "observe_privileged": False}, **others))
         return made[-1]
 
     options = certificate_options(run.config, {"ranking": 4, "episodes": 200, "tests": 1})
