@@ -1,15 +1,14 @@
 """Generalised advantage estimates for the reward and for k costs at once.
 
-Rollouts are [..., T] TensorDicts; time is the last dimension, or the one named "time". A trajectory
-ends where ``("next", "done")`` is set, at the last step of the batch, and where the mask of a
-padded rollout ends or ``traj_ids`` change. Unless it ends with ``("next", "terminated")``, the
-value of its last observation is bootstrapped.
+Rollouts are [..., T] TensorDicts; time is the last dimension. A trajectory ends where
+``("next", "done")`` is set, at the last step of the batch, and where the mask of a padded rollout
+ends or ``traj_ids`` change. Unless it ends with ``("next", "terminated")``, the value of its last
+observation is bootstrapped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -92,63 +91,17 @@ class VectorGAE(Checked, ValueEstimatorBase):
 
     @dispatch
     @torch.no_grad()
-    def forward(
-        self,
-        tensordict: TensorDictBase,
-        *,
-        params: TensorDictBase | None = None,
-        target_params: TensorDictBase | None = None,
-        time_dim: int | None = None,
-    ) -> TensorDictBase:
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write values, advantages and value targets into a rollout; they are 0 in padding.
 
         Args:
             tensordict: Rollout [..., T] with `in_keys`, or these entries as keyword arguments.
-            params: Parameters to run the value network with instead of its own.
-            target_params: Must be None; a single pass has a single set of parameters.
-            time_dim: Dimension of time; None: the one that has the name ``"time"``, or the last.
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If values, signals and ends do not match in shape, if there is a dimension
-                between time and the signals, or if `target_params` is given.
+            ValueError: If values, signals and ends do not match in shape, or if there is a
+                dimension between time and the signals.
         """
-        keys = self.tensor_keys
-        value, advantage, target = self._estimate(tensordict, params, None, target_params, time_dim)
-        tensordict.set(keys.value, value)
-        tensordict.set(keys.advantage, advantage)
-        return tensordict.set(keys.value_target, target)
-
-    @torch.no_grad()
-    def value_estimate(
-        self,
-        tensordict: TensorDictBase,
-        target_params: TensorDictBase | None = None,
-        next_value: Tensor | None = None,
-        time_dim: int | None = None,
-        **kwargs: Any,
-    ) -> Tensor:
-        """The value targets alone, [..., T, F]; `next_value` [..., T, F] replaces the network's."""
-        return self._estimate(tensordict, None, next_value, target_params, time_dim)[-1]
-
-    def _estimate(
-        self,
-        tensordict: TensorDictBase,
-        params: TensorDictBase | None,
-        next_value: Tensor | None,
-        target_params: TensorDictBase | None,
-        time_dim: int | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Value, advantage and value target, [..., T, F] each."""
-        time = self._get_time_dim(time_dim, tensordict)
-        if time != tensordict.ndim - 1:
-            following = None if next_value is None else next_value.transpose(time, -2)
-            rows = tensordict.transpose(time, -1)
-            estimates = self._estimate(rows, params, following, target_params, -1)
-            value, advantage, target = (each.transpose(time, -2) for each in estimates)
-            return value, advantage, target
-        if target_params is not None:
-            raise ValueError("target_params needs two passes: use torchrl.objectives.value.GAE.")
         keys = self.tensor_keys
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
         done, terminated = (
@@ -166,8 +119,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         reward = torch.cat(signals, -1)
         mask = sample_mask(tensordict)
         ends = trajectory_ends(done, mask, tensordict.get(("collector", "traj_ids"), None))
-        value, following = self._values(tensordict, ends, params)
-        next_value = following if next_value is None else next_value
+        value, next_value = self._values(tensordict, ends)
         if value.shape != reward.shape:
             raise ValueError(
                 f"{keys.value!r} has shape {tuple(value.shape)} but the signals "
@@ -187,11 +139,11 @@ class VectorGAE(Checked, ValueEstimatorBase):
         target = value + (estimate(lmbda=1.0) if to_go else advantage)
         if mask is not None:
             advantage, target = (x.masked_fill(padded, 0.0) for x in (advantage, target))
-        return value, advantage, target
+        tensordict.set(keys.value, value)
+        tensordict.set(keys.advantage, advantage)
+        return tensordict.set(keys.value_target, target)
 
-    def _values(
-        self, tensordict: TensorDictBase, ends: Tensor, params: TensorDictBase | None
-    ) -> tuple[Tensor, Tensor]:
+    def _values(self, tensordict: TensorDictBase, ends: Tensor) -> tuple[Tensor, Tensor]:
         """Values of the observations and of the next observations, both [..., T, F].
 
         Inside a trajectory the next observation of step t is the root observation of step t + 1. So
@@ -207,8 +159,7 @@ class VectorGAE(Checked, ValueEstimatorBase):
         last = tensordict.get("next").select(*network.in_keys)[ends]
         if FIRST in network.in_keys:
             last = last.unsqueeze(-1)
-        own = nullcontext() if params is None else params.to_module(network)
-        with own, set_recurrent_mode(True):
+        with set_recurrent_mode(True):
             value = require(network(tensordict.select(*network.in_keys)), key)
             value_at_ends = network(last).get(key)
         next_value = value.roll(-1, dims=-2)
@@ -300,11 +251,11 @@ class JointAdvantages(TensorDictModuleBase):
             ends = {name: kwargs[name] for name in ("done", "terminated") if name in kwargs}
             self.cost.set_keys(**ends)
 
-    def forward(self, tensordict: TensorDictBase, *, time_dim: int | None = None) -> TensorDictBase:
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write advantages and value targets into a rollout [..., T], and return it."""
-        self.reward(tensordict, time_dim=time_dim)
+        self.reward(tensordict)
         keys = {"advantage": self.reward.tensor_keys.advantage}
         if self.cost is not None:
-            self.cost(tensordict, time_dim=time_dim)
+            self.cost(tensordict)
             keys["cost_advantage"] = self.cost.tensor_keys.advantage
         return normalise_advantages(tensordict, **keys)
