@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import mujoco
@@ -23,7 +23,7 @@ from safe_rl.extras import require_extra
 
 
 class SimulatedEnv(ConstrainedEnv):
-    """N simulated worlds: seeds, episodes, states and copies, for any family.
+    """N simulated worlds: seeds, episodes and states, for any family.
 
     The class of a family builds the physics, observer and renderer, and implements how episodes
     begin, how worlds are stepped, and how their state is read and written.
@@ -42,8 +42,6 @@ class SimulatedEnv(ConstrainedEnv):
     first_camera: ClassVar[str]
     #: Keys that may be missing in a state that is set.
     optional: ClassVar[tuple[str, ...]] = ("seed", "episode", "dynamics")
-    #: Attributes, tensors, that a copy gets in addition to the state.
-    copied: ClassVar[tuple[str, ...]] = ("_row_seed", "_has_cost", "_begun", "_ended")
 
     #: Simulated time of a step [s].
     seconds_per_step: float
@@ -62,7 +60,6 @@ class SimulatedEnv(ConstrainedEnv):
         num_envs = check_key("num_envs", Count, num_envs)
         check_key("num_threads", Threads, num_threads)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
-        self._physics_settings: tuple[Any, ...] = (num_threads,)
 
     def _make_physics(
         self,
@@ -270,20 +267,6 @@ class SimulatedEnv(ConstrainedEnv):
                 )
             if not value.dtype.is_floating_point and given.dtype != value.dtype:
                 raise ValueError(f"State '{key}' must be {value.dtype}, got {given.dtype}.")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Let `copy` and `pickle` build a new environment and set its state by `set_state`."""
-        settings = (self.config, self.batch_size[0], self.device, 0, *self._physics_settings)
-        tensors = {name: getattr(self, name).clone() for name in self.copied}
-        return type(self), settings, (self.get_state(), tensors)
-
-    def __setstate__(self, kept: tuple[TensorDict, Mapping[str, Tensor]]) -> None:
-        state, tensors = kept
-        if tensors["_begun"].any():  # otherwise the state is that of a new environment
-            self.set_state(state)
-        for name, tensor in tensors.items():
-            setattr(self, name, tensor)
-        self._all_begun = bool(self._begun.all())
 
     def render(
         self,

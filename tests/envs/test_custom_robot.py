@@ -1,6 +1,5 @@
 """Robots by the path of an MJCF file: what works, and the errors for files that do not."""
 
-import copy
 import math
 
 import numpy as np
@@ -227,12 +226,11 @@ def test_what_actuators_remember_is_part_of_a_state(make, kind):
     here = env.reset()
     for _ in range(10):
         here = env.step(here.set("action", torch.ones(2, 3)))["next"]
-    state, twin = env.get_state(), copy.deepcopy(env)
+    state = env.get_state()
     if kind == "filter":  # 100 substeps of Euler's
         remembered = torch.full((2,), 1 - (1 - 0.004 / 0.5) ** 100, dtype=torch.float64)
         torch.testing.assert_close(state["act"][:, 0], remembered)
     onward = env.step(here.clone().set("action", idle))["next", "observation"]
-    assert torch.equal(twin.step(here.clone().set("action", idle))["next", "observation"], onward)
     env.set_state(state)
     assert torch.equal(env.step(here.clone().set("action", idle))["next", "observation"], onward)
 

@@ -1,6 +1,5 @@
 """MuJoCo Warp beside MuJoCo, on Warp's CPU device."""
 
-import pickle
 from importlib.util import find_spec
 
 import pytest
@@ -125,10 +124,6 @@ def test_robots_on_warp_follow_the_rules_of_environments(name):
     # episodes of any number of steps, and each row begins its own
     rollout = env.rollout(50, break_when_any_done=False)
     assert rollout["next", "done"].any()
-    copied = pickle.loads(pickle.dumps(env))
-    action = {"action": env.action_spec.rand()}
-    first, second = (each._step(each.fake_tensordict().update(action)) for each in (env, copied))
-    torch.testing.assert_close(first, second, atol=1e-4, rtol=1e-4)
 
 
 def test_the_observation_of_a_robot_whose_physics_failed_has_numbers():
@@ -149,19 +144,16 @@ def test_graphs_replay_what_is_launched_one_by_one():
         assert all(torch.equal(value, following[key]) for key, value in state.items())
 
 
-def test_a_resumed_and_a_pickled_environment_continue_alike():
+def test_a_resumed_environment_continues_as_the_first():
     env = SafetyGymEnv(resolve(BUSY | {"physics": "warp"}), 4, seed=3)
     env.rollout(5)
-    copied = pickle.loads(pickle.dumps(env))
     action = env.action_spec.rand()
     start = env.get_state()
     first = env._step(env.fake_tensordict().set("action", action))
-    second = copied._step(env.fake_tensordict().set("action", action))
     env.set_state(start)
-    third = env._step(env.fake_tensordict().set("action", action))
+    second = env._step(env.fake_tensordict().set("action", action))
     for key, value in first.items():
         torch.testing.assert_close(value, second[key], atol=1e-4, rtol=1e-4)
-        torch.testing.assert_close(value, third[key], atol=1e-4, rtol=1e-4)
     assert env.get_positions()["gremlins"].shape == (4, 1, 3)
 
 

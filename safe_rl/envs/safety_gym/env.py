@@ -79,7 +79,6 @@ class SafetyGymEnv(SimulatedEnv):
         *(*SimulatedEnv.optional, *episodes.LAYOUT_KEYS, "fixed_layout", "target_quat"),
         *("ctrl", "act", "history", "last_costs", "cost_traces", "since_goal"),
     )
-    copied: ClassVar = ("_fixed_layout", *SimulatedEnv.copied)
 
     def __init__(
         self,
@@ -91,7 +90,6 @@ class SafetyGymEnv(SimulatedEnv):
         sleep: bool = True,
     ) -> None:
         super().__init__(num_envs, device, num_threads)
-        self._physics_settings += (sleep,)
         self.config = resolve(env)
         scene = build_scene(self.config, sleep and self.config.physics == "cpu")
         bodies = slice(1, scene.free_bodies.start)
