@@ -26,7 +26,7 @@ def listed(kind: str) -> str:
     for page in sorted(PAGES.glob("*.md")):
         short = re.search(r"^<!-- row: (.*) -->$", text := page.read_text(), re.M)
         source = re.search(r"^\[`algo=\w+`\]\(\S+\) · (.*)$", text, re.M)
-        has_buffer = re.search("groups .*`memory`", text) is not None
+        has_buffer = re.search("Groups of .*`memory`", text) is not None
         if short and source and has_buffer == (kind == "OffPolicy"):
             rows.append(f"| [`{page.stem}`]({page.name}) | {short[1]} | {source[1]} |")
     return "\n".join([_HEAD, *rows])

@@ -21,5 +21,5 @@ def made(page, name):
 
 def columns_of(algo):
     """Groups of the columns that an algorithm logs."""
-    (line,) = re.findall(r"^The \[columns\].* groups (.*)\.$", page_of(algo), re.M)
+    (line,) = re.findall(r"^Groups of \[columns\].*: (.*)\.$", page_of(algo), re.M)
     return re.findall(r"`(\w+)`", line)
