@@ -294,7 +294,7 @@ def readme() -> str:
 
 def policies() -> str:
     """The certified policies in the package: how each was trained, and what its test found."""
-    rows = []
+    rows: Rows = []
     for folder in (ROOT / "safe_rl" / "policies" / env for env in SUITE):
         if not folder.is_dir():
             continue
