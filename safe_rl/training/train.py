@@ -87,7 +87,7 @@ def train(
     run, say = Run(directory), print_line if program else lambda line: None
     complete(config, run)
     again = partial(_command_again, run, config, program)
-    with _ending_cleanly(run, config), lock_folder(run.lock_file):
+    with _ending_cleanly(run, config), _alone(run), lock_folder(run.lock_file):
         if continues and is_finished(run.checkpoints("last"), config.frames):
             done = f"{run.directory} has {run.steps:,} frames already"
             print(f"{done}. To train on: {again(2 * max(run.steps, config.frames))}")
@@ -114,6 +114,23 @@ def train(
         if is_to_keep_limits(config):
             certify_finished(run, config, length, stopped_by=stopped_by, again=again, say=say)
     return run
+
+
+_TRAINED: dict[int, Run] = {}  # process -> the run that it trains; a fork trains none
+
+
+@contextmanager
+def _alone(run: Run) -> Iterator[None]:
+    """Refuse to train twice at a time in one process, which has one generator of random numbers."""
+    if _TRAINED.setdefault(os.getpid(), run) is not run:
+        raise RunInUseError(
+            f"{run.directory}: this process trains a run already, and both would draw from one "
+            "generator. Train one after the other, or in processes of their own, as a sweep does."
+        )
+    try:
+        yield
+    finally:
+        del _TRAINED[os.getpid()]
 
 
 def complete(config: DictConfig, run: Run) -> None:

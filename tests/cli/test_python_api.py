@@ -21,6 +21,7 @@ import safe_rl
 from safe_rl.cli.composing import compose_run, overrides_of
 from safe_rl.envs import ConfigError
 from safe_rl.reporting.archive import archive_runs, read_runs
+from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.table import read_table
 from safe_rl.training.trainer import Trainer
 
@@ -355,3 +356,9 @@ def test_callbacks_see_every_epoch_and_may_end_the_run(tmp_path):
     run = safe_rl.resume(tmp_path, frames=400, callbacks=[lambda row: row["steps"] < 120])
     assert run.table["steps"] == [40, 80, 120]
     assert safe_rl.resume(tmp_path, frames=200).table["steps"][-1] == 200
+
+    def another(row):  # it would seed the generator of this run
+        safe_rl.train("PointGoal1", directory=tmp_path / "other", frames=40, **SMALL)
+
+    with pytest.raises(RunInUseError, match="this process trains a run already"):
+        safe_rl.resume(tmp_path, frames=400, callbacks=[another])
