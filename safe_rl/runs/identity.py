@@ -165,7 +165,8 @@ def changed_settings(composed: Any, settings: Mapping[str, Any]) -> dict[str, An
         key: value
         for key, value in flatten(settings).items()
         # values that Hydra computes are not known: nothing of a file is resolved
-        if before.get(key, value) != value
+        if key in before
+        and before[key] != value
         and "${" not in str(before[key])
         and role_of(key) in OF_EXPERIMENTS
     }
