@@ -74,7 +74,7 @@ def compose_run(
     `words` are overrides, `folders` those of ``--config-dir``, `name` is the primary configuration.
 
     Raises:
-        ValueError: If Hydra refuses a word or a file, in one line.
+        ValueError: If a folder does not exist, or Hydra refuses a word or a file, in one line.
 
     Examples:
         >>> compose_run(["env=CarGoal1", "seed=3"]).seed
@@ -82,6 +82,9 @@ def compose_run(
     """
     store_configs()
     places = [Path(folder).expanduser().absolute() for folder in folders]
+    for place in places:
+        if not place.is_dir():  # Hydra would pass over it
+            raise ValueError(f"config_dir={place}: there is no such folder.")
     searched = {"hydra.searchpath": [f"file://{place}" for place in places]} if places else {}
     words = [*overrides_of(searched), *words]
     try:

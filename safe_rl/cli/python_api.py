@@ -94,6 +94,10 @@ def train(
             "env and algo are names. safe_rl.envs.store_config(name, {…}) gives one to an "
             "environment of your own, a YAML file below config_dir=… to an algorithm."
         )
+    if "resume" in settings:
+        raise ValueError("safe_rl.resume(directory) continues a run.")
+    if directory == "":
+        raise ValueError("directory=… names the folder of the run.")
     folders = [config_dir] if isinstance(config_dir, str | Path) else config_dir or ()
     modules = [imports] if isinstance(imports, str) else list(imports)
     import_modules(modules)

@@ -131,12 +131,16 @@ def test_hydra_is_left_as_it_was(tmp_path, monkeypatch):
         ({"imports": ["users_nowhere"]}, "import=users_nowhere"),
         ({"note": r"price \${5}", "frames": 40, **SMALL}, r"has '\$\{' .*no run could be opened"),
         ({"callbacks": 3}, "callbacks must be a list of functions"),
+        ({"config_dir": "nowhere"}, "config_dir=.*nowhere: there is no such folder"),
+        ({"resume": "run"}, r"safe_rl\.resume"),
+        ({"directory": ""}, "names the folder of the run"),
     ],
 )
-def test_errors_name_the_setting(settings, message, tmp_path):
+def test_errors_name_the_setting(settings, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=message):
-        safe_rl.train(directory=tmp_path / "run", **settings)
-    assert not (tmp_path / "run").exists()
+        safe_rl.train(**{"directory": "run", **settings})
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_folders_of_ones_own_one_or_several(tmp_path):
