@@ -85,7 +85,11 @@ def test_rows_that_continue_keep_their_budget_when_others_begin():
     env = transformed(Priced([[1.0] * 9, [1.0] * 9]), "saute")
     state = still(env, 1)[:, -1]["next"].select("observation")
     begun = env.reset(state.set("_reset", torch.tensor([[True], [False]])))
-    assert begun["observation"][:, -1].tolist() == pytest.approx([1.0, (1 - 1 / 2) / 0.9])
+    after_one = (1 - 1 / 2) / 0.9
+    assert begun["observation"][:, -1].tolist() == pytest.approx([1.0, after_one])
+    # TorchRL keeps the entries of rows that continue, whatever the transform has
+    later = env.step(begun.set("action", torch.zeros(2, 2)))["next", "observation"][:, -1]
+    assert later.tolist() == pytest.approx([after_one, (after_one - 1 / 2) / 0.9])
 
 
 def test_a_spent_budget_replaces_the_reward_and_the_own_one_is_kept():
