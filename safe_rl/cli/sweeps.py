@@ -11,6 +11,7 @@ import math
 import os
 import sys
 import traceback
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,9 @@ class Summary(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Let jobs at a time share the cores."""
+        if not config.hydra.sweep.dir:
+            # of other errors Hydra would only warn
+            sys.exit("hydra.sweep.dir= is empty: it names the folder of the sweep.")
         self._log.parent.mkdir(parents=True, exist_ok=True)
         workers = config.hydra.launcher.get("n_jobs")
         if workers is not None:
@@ -144,6 +148,12 @@ class Summary(Callback):
         if not last:
             sys.exit("The sweep has no runs: a glob(…) or range(…) in it is empty.")
         unfinished = [f"  {state}: {place}" for state, place in last if state != "done"]
+        if shared := [place for place, jobs in Counter(p for _, p in last).items() if jobs > 1]:
+            print(
+                f"Several jobs have the folder {shared[0]}, in which only the first has trained: "
+                "what they differ in is not in its name. To train all of them: "
+                "hydra.sweep.subdir='my_sweep/${hydra.job.num}'"
+            )
         print(f"Sweep: {len(last) - len(unfinished)} of {len(last)} runs are finished.")
         if unfinished:
             print(*unfinished, sep="\n")

@@ -137,6 +137,8 @@ def job(config: DictConfig) -> float | None:
     directory = Path(settings.runtime.output_dir)
     if settings.mode == RunMode.MULTIRUN:
         return run_in_sweep(config, settings, directory)
+    if not settings.run.dir:
+        sys.exit("hydra.run.dir= is empty: it names the folder of the run.")
     is_resumed = settings.job.config_name == RESUMED
     try:
         if is_resumed:

@@ -45,8 +45,8 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
             raise outcome
         return outcome
 
-    def carry_out(number):
-        directory = tmp_path / f"seed{number}"
+    def carry_out(number, folder=None):
+        directory = tmp_path / f"seed{number if folder is None else folder}"
         node = {"job": {"num": number}, "mode": "MULTIRUN", "runtime": {"choices": {}}}
         node["runtime"]["config_sources"] = []
         node["overrides"] = {"task": []}
@@ -83,6 +83,9 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
         carry_out(number)
     summary.on_multirun_end(None)
     assert capsys.readouterr().out == "Sweep: 3 of 3 runs are finished.\n"
+    carry_out(3, folder=0)  # a key that is not in a folder's name, such as num_threads
+    summary.on_multirun_end(None)
+    assert f"Several jobs have the folder {tmp_path}/seed0, in" in capsys.readouterr().out
 
 
 def test_sweeps_and_runs_that_begin_in_the_same_second_have_files_of_their_own():
