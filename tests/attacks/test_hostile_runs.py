@@ -7,6 +7,7 @@ import signal
 
 import pytest
 import torch
+import yaml
 from attacking import RUN, cases
 from omegaconf.errors import OmegaConfBaseException
 from run_configs import compose_config
@@ -91,7 +92,8 @@ def edit(random, path):
     elif path.suffix == ".yaml":
         from omegaconf import OmegaConf
 
-        OmegaConf.save(edited(random, OmegaConf.to_container(OmegaConf.load(path))), path)
+        content = OmegaConf.to_container(OmegaConf.load(path))
+        path.write_text(yaml.safe_dump(edited(random, content)))
     else:
         change_bytes(random, path)
 
