@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -292,26 +291,5 @@ def readme() -> str:
     )
 
 
-def policies() -> str:
-    """The certified policies in the package: how each was trained, and what its test found."""
-    rows: Rows = []
-    for folder in (ROOT / "safe_rl" / "policies" / env for env in SUITE):
-        if not folder.is_dir():
-            continue
-        about, test = (
-            json.loads((folder / name).read_text()) for name in ("policy.json", "certificate.json")
-        )
-        presets = [f"`{word}`" for word in about["command"].split() if word.startswith("preset=")]
-        rows.append({
-            "name": f"`certified/{folder.name}`",
-            "algorithm": ", ".join([f"`{about['algorithm']}`", *presets]),
-            "training steps": f"{about['steps']:,}",
-            "certified mean cost": f"≤ {rounded_up(test['bounds']['mean_cost']['bound']):.1f}",
-            "return": f"{test['episode_return']:.1f}",
-            "episodes of the test": f"{test['episodes']:,}",
-        })  # fmt: skip
-    return markdown(rows[0], (row.values() for row in rows))
-
-
 TABLES = (three_million, rivals, paper_preset, coverage, compared, measured, single, parts)
-TABLES += (velocity_runs, paper_tables, readme, policies)
+TABLES += (velocity_runs, paper_tables, readme)

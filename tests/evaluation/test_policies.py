@@ -22,6 +22,7 @@ from safe_rl.cli.export import main as export
 from safe_rl.evaluation import EvaluationOptions, policies
 from safe_rl.evaluation import evaluate as measure
 from safe_rl.evaluation.episodes import exploration
+from safe_rl.scores.bounds import rounded_up
 
 QUICK = ("episodes=2", "num_envs=2", "num_threads=1")
 
@@ -112,12 +113,17 @@ def test_an_export_that_was_killed_can_be_repeated(run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", sorted(policies.POLICIES.glob("*/certificate.json")), ids=str)
-def test_policies_of_the_package_are_certified_and_small(path):
+def test_policies_of_the_package_are_certified_and_small_and_as_their_page_says(path):
     certificate, about = (
         json.loads((path.parent / name).read_text()) for name in ("certificate.json", "policy.json")
     )
     assert certificate["certified"]
     assert len(about["commit"]) == 40
+    bound = rounded_up(certificate["bounds"]["mean_cost"]["bound"])
+    row = f"| {about['steps']:,} | ≤ {bound:.1f} | {certificate['episode_return']:.1f} |"
+    lines = PAGE.read_text().splitlines()
+    (line,) = (line for line in lines if line.startswith(f"| `certified/{path.parent.name}` |"))
+    assert f"{row} {certificate['episodes']:,} |" in line
     assert sum(file.stat().st_size for file in path.parent.rglob("*")) < 150_000
 
 
