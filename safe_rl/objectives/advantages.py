@@ -99,10 +99,12 @@ class VectorGAE(Checked, ValueEstimatorBase):
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If values, signals and ends do not match in shape, or if there is a
-                dimension between time and the signals.
+            ValueError: If values, signals and ends do not match in shape, if there is a dimension
+                between time and the signals, or if another dimension has the name ``"time"``.
         """
         keys = self.tensor_keys
+        if self._get_time_dim(None, tensordict) != tensordict.ndim - 1:
+            raise ValueError(f"'time' must be the last of the dimensions {tensordict.names}.")
         signals = [require(tensordict, ("next", key)) for key in self.reward_keys]
         done, terminated = (
             require(tensordict, ("next", key)) for key in (keys.done, keys.terminated)

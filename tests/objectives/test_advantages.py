@@ -147,6 +147,8 @@ def test_errors_say_what_to_change():
         with pytest.raises(ValueError, match=r"In a rollout \[4, 37\], .* agents"):
             reward(of_agents)
     cost.set_keys(reward=["cost_hazards"])
+    with pytest.raises(ValueError, match=r"'time' must be the last .* \['time', None\]"):
+        cost(rollout.clone().refine_names("time", None))
     rollout["next", "cost_hazards"] = rollout["next", "cost_hazards"].squeeze(-1)
     with pytest.raises(ValueError, match=r"shapes \[\[4, 37\]\] and .* use unsqueeze\(-1\)"):
         cost(rollout)
