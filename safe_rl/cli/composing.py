@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from shlex import quote
+from threading import RLock
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -37,6 +38,8 @@ from safe_rl.trust import check_imports
 _MOST_LISTED = 40
 RESUMED = "resumed"
 """Name in Hydra's ConfigStore of the configuration of a run that is continued."""
+COMPOSING = RLock()
+"""Held while Hydra composes: its state and its ConfigStore are those of the process."""
 COMPOSITION_ERRORS = (
     *(HydraException, OmegaConfBaseException, YAMLError),
     *(ValueError, AttributeError),  # Hydra's of logger=null, OmegaConf's of missing sections
@@ -97,13 +100,14 @@ def compose_run(
 
 def _compose(words: Sequence[str], name: str = "config") -> DictConfig:
     # an application of the user's may be on Hydra too, and call `safe_rl.train`
-    outside = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
-            return compose(name, list(words), return_hydra_config=True)
-    finally:
-        GlobalHydra.instance().hydra = outside
+    with COMPOSING:
+        outside = GlobalHydra.instance().hydra
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_dir(str(CONF), job_name="train", version_base="1.3"):
+                return compose(name, list(words), return_hydra_config=True)
+        finally:
+            GlobalHydra.instance().hydra = outside
 
 
 def overrides_of(settings: Mapping[str, Any]) -> Iterator[str]:
@@ -194,13 +198,19 @@ def _unknown_key(error: Any) -> str:
     if section == key:  # the whole section may be wrong, as in los.clip_epsilon=0.1
         known += map(str, config)
     if section == "cost_limits" or key.startswith("limits.cost"):
-        example = f"{{{key.partition('.')[2]}: 10}}"
+        cost = key.partition(".")[2]
         given = config.get("cost_limits") not in ("default", {})  # {}: made to hold this key
-        added = f" To add this one to those of a file: +{key}=…" if given else ""
-        return f"{key}: limits are given together, cost_limits='{example}'.{added}"
+        added = f" To add this one to those of a file: +cost_limits.{cost}=…" if given else ""
+        return f"{key}: limits are given together, cost_limits='{{{cost}: 10}}'.{added}"
     if config.get(section) == {} and section != "transforms":  # made to hold this key
         return f"this algorithm has no '{section}'. If another one of a sweep has it: '++{key}=…'."
-    return unknown_key(key, known)
+    message = unknown_key(key, known)
+    if message.endswith("?") or key.rpartition(".")[0] == "transforms":
+        return message  # a transform that only some runs of a sweep have cannot be added
+    return (
+        f"{message} One that a class of yours takes, or another algorithm of a sweep, is added: "
+        f"'++{key}=…'."
+    )
 
 
 def read_resumed(

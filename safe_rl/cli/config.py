@@ -8,6 +8,7 @@ by the parts' constructors; an environment checks its own.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, is_dataclass
 from typing import Annotated, Any, Literal, get_args, get_type_hints
@@ -219,6 +220,11 @@ def check_settings(config: DictConfig) -> None:
         _check(General, config, "")
         _check(Algo, config.algo, "algo", is_open=True)
         _check(CertificateOptions, config.certificate, "certificate")
+        for name in {"tail", "deterministic"} & {*config.certificate}:
+            raise SettingError(
+                f"certificate.{name}: leave it out. The tail is the risk's (risk=cvar "
+                "risk.tail=…), and a run is certified with sampled actions."
+            )
         if not OmegaConf.is_dict(config.model) or "_target_" not in config.model:
             _check(Model, config.model, "model")
         check_value("env.name", Folder, config.env.name)
@@ -249,6 +255,12 @@ def _check_together(config: DictConfig) -> None:
 
 def _check_parts(config: DictConfig) -> None:
     """Refuse what a preset or a command has added to an algorithm without such a part."""
+    updates = (config.get(name) for name in ("policy_update", "critic_update"))
+    compiled = any(OmegaConf.is_dict(update) and "compile" in update for update in updates)
+    if config.get("compile") and not compiled:
+        warnings.warn(
+            f"compile has no effect: algo={config.algo.name} compiles nothing.", stacklevel=2
+        )
     # an algorithm of the user's own may do without some of them
     is_of_package = str(config.algo.get("_target_")).startswith("safe_rl.")
     if is_of_package and (misplaced := General.__annotations__.keys() & config.algo.keys()):
@@ -319,9 +331,5 @@ def unknown_key(key: str, known: Iterable[str]) -> str:
     known = [path for path in known if path != key]
     same = [path for path in known if path.rpartition(".")[2] == key.rpartition(".")[2]]
     names = " or ".join(f"'{path}'" for path in same or filter(None, [nearest(key, known, 0.7)]))
-    if names:
-        return f"there is no key '{key}'. Did you mean {names}?"
-    return (
-        f"there is no key '{key}'. '--cfg job' prints all of this algorithm and environment. One "
-        f"that a class of yours takes, or another algorithm of a sweep, is added: '++{key}=…'."
-    )
+    hint = f"Did you mean {names}?" if names else "'--cfg job' prints all that there are."
+    return f"there is no key '{key}'. {hint}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from hashlib import sha256
 from pathlib import Path
@@ -56,9 +57,14 @@ def name_choices(config: DictConfig, hydra: Any) -> None:
     """Give a run the names of what was chosen: whatever was merged into it, the name is true.
 
     Raises:
-        ValueError: If a changed environment has the name of another one of the package.
+        ValueError: If a transform is chosen twice, or a changed environment has the name of another
+            one of the package.
     """
     choices, transforms = hydra.runtime.choices, config.get("transforms") or ()
+    for word in hydra.overrides.task:
+        names = re.findall(r"[^][,\s]+", word.removeprefix("transforms="))
+        if word.startswith("transforms=[") and len(set(names)) < len(names):
+            raise ValueError(f"{word}: a transform is there twice, and would be applied once.")
     chosen_files = [*choices.items(), *(("transforms", name) for name in transforms)]
     _refuse_hidden_files(chosen_files, hydra.runtime.config_sources)
     if "algo" in choices:

@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 
 from safe_rl.cli import report as report_command
 from safe_rl.cli.composing import (
+    COMPOSING,
     RESUMED,
     compose_run,
     overrides_of,
@@ -140,8 +141,9 @@ def resume(
     modules = [imports] if isinstance(imports, str) else imports
     import_modules(modules)
     words = list(overrides_of(settings))
-    ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
-    config = compose_run(words, name=RESUMED)
+    with COMPOSING:
+        ConfigStore.instance().store(RESUMED, read_resumed(folder.absolute(), modules, words))
+        config = compose_run(words, name=RESUMED)
     refuse_changes(folder.absolute(), config)
     check_settings(config)
     return _carry_out(config, folder, callbacks, continues=True)

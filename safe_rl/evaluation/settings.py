@@ -136,4 +136,4 @@ def certificate_options(
     is_measured = OmegaConf.select(config, "risk._target_") and has_tested_measure(config)
     risk = config.risk if is_measured else {}
     share = min(options["most_over"], risk.get("most_over", 1.0))
-    return CertificateOptions(**{"tail": risk.get("tail", 1.0), **options, "most_over": share})
+    return CertificateOptions(**options | {"most_over": share}, tail=risk.get("tail", 1.0))

@@ -131,3 +131,8 @@ def test_parts_of_ones_own_are_checked_by_what_they_inherit(monkeypatch):
     OmegaConf.update(config, "lagrangian.patience", "anything", force_add=True)
     assert not outcome(config, "note", "none")
     assert "lagrangian.kp=nan: it must be" in outcome(config, "lagrangian.kp", math.nan)
+
+
+def test_an_algorithm_that_compiles_nothing_says_so():
+    with pytest.warns(UserWarning, match="compile has no effect: algo=sac"):
+        check_settings(compose_config("algo=sac", "compile=true"))

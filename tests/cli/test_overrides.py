@@ -28,7 +28,7 @@ WRONG = {
     "lr=1e-4": "Did you mean 'policy_update.optimizer.lr' or 'critic_update.optimizer.lr'",
     "los.entropy_coeff=0.1": r"^there is no key 'los'\. Did you mean 'loss'\?$",
     "certificate={episodez: 5}": r"Did you mean '\S*certificate\.episodes'",
-    "zzzzz=3": "^there is no key 'zzzzz'. '--cfg job' prints all of this algorithm and env",
+    "zzzzz=3": r"^there is no key 'zzzzz'\. '--cfg job' prints all .* added: '\+\+zzzzz=…'\.$",
     "env=PointGaol1": "no env 'PointGaol1'. Did you mean 'PointGoal1'",
     "env=zzzzz": r"no env 'zzzzz'\. 'python train.py --help' names all; a file of yours needs",
     "env=CartPole-v1": r"no env 'CartPole-v1'\. It is one of Gymnasium's: env=gymnasium env\.id",
@@ -43,7 +43,9 @@ WRONG = {
     "limits={cost: 25}": r"^limits\.cost: limits are given together, cost_limits=",
     "limits=25": r"^limits=25: 'limits' is a section.* cost_limits='\{cost: 25\}'\.$",
     "loss=sac": r"^loss=sac: 'loss' is a section; its keys, .* one by one, loss\.<key>=…\.$",
-    "logger=null": r"no logger 'null'\. Did you mean 'none'",
+    "logger=null": r"no logger 'null'\. Did you mean 'none'\?$",
+    "+certificate.tail=0.1": r"^certificate\.tail: leave it out\. The tail is the risk's",
+    "+mine=3": r"^there is no key 'mine'\. '--cfg job' prints all that there are\.$",
     "logger@mine=none": r"^Could not override 'logger@mine'\. Did you mean to override logger\?",
     "slate=SG7": "Unknown slate 'SG7'",
     "hydra.launcher=joblib": r"^hydra\.launcher=joblib: .* slash, hydra/launcher=joblib\.$",
@@ -190,6 +192,17 @@ def test_a_file_of_an_environment_without_its_name(tmp_path):
     (tmp_path / "env" / "nameless.yaml").write_text("_target_: mine.make\n")
     said = status_of(f"--config-dir={tmp_path}", "env=nameless")
     assert said == "env: the file of an environment needs a line 'name: …'."
+
+
+def test_a_limit_below_limits_is_added_to_the_cost_limits():
+    with pytest.raises(ValueError, match=r"of a file: \+cost_limits\.cost=…$"):
+        composed("cost_limits={cost: 5}", "limits.cost=3")
+
+
+def test_keys_of_swept_transforms_get_no_advice_that_would_fail():
+    message = status_of("-m", "transforms=[],[saute]", "transforms.saute.kappa=2")
+    assert "no key 'transforms.saute'" in message
+    assert "++" not in message
 
 
 def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():

@@ -33,6 +33,7 @@ def test_configurations_are_shown(command):
         (["init_from=nowhere"], "init_from=nowhere: there is no such folder or file."),
         (["hydra.run.dir="], "hydra.run.dir= is empty"),
         (["-m", "hydra.sweep.dir="], "hydra.sweep.dir= is empty"),
+        (["transforms=[saute,saute]"], "a transform is there twice"),
         (["logger.exp_name=3"], "logger.exp_name=3: it must be a valid string"),
         (["logger._target_=torch.optim.Adam"], "logger.exp_name: Adam has no such argument. Leave"),
         (
