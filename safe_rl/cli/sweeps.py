@@ -27,7 +27,6 @@ from safe_rl.cli.folders import name_choices
 from safe_rl.files import replace_text
 from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.identity import differences, is_to_keep_limits
-from safe_rl.runs.progress_bar import LINE_SECONDS
 from safe_rl.runs.run import Run
 from safe_rl.runs.table import violation
 from safe_rl.trust import import_modules
@@ -111,6 +110,8 @@ class Summary(Callback):
         workers = config.hydra.launcher.get("n_jobs")
         if workers is not None:
             import joblib  # it comes with this launcher
+
+            from safe_rl.runs.progress_bar import LINE_SECONDS
 
             threads = max(1, joblib.cpu_count() // joblib.effective_n_jobs(workers))
             os.environ["SAFE_RL_NUM_THREADS"] = str(threads)

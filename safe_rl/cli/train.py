@@ -38,7 +38,6 @@ from safe_rl.cli.sweeps import run_in_sweep
 from safe_rl.envs import store_configs
 from safe_rl.files import CONF, printable
 from safe_rl.naming import did_you_mean
-from safe_rl.scores.benchmark import SLATES
 from safe_rl.trust import import_modules
 
 
@@ -111,6 +110,8 @@ def prepare(words: Sequence[str]) -> list[str]:
         return [*words, *flags, f"--config-name={RESUMED}"]
     new = [] if modules is None else [*overrides_of({"import": modules})]
     for name in slates:
+        from safe_rl.scores.benchmark import SLATES  # reads the published scores
+
         if name not in SLATES:
             raise ValueError(
                 f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "
