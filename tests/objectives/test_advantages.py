@@ -23,26 +23,12 @@ def loop_gae(reward, value, next_value, done, terminated, gamma, lmbda):
     return advantage
 
 
-def loop_return_to_go(reward, next_value, done, terminated, gamma):
-    returns = torch.zeros_like(reward)
-    for n in range(reward.shape[0]):
-        for t in reversed(range(reward.shape[1])):
-            if terminated[n, t]:
-                following = 0.0
-            elif done[n, t] or t == reward.shape[1] - 1:
-                following = next_value[n, t]
-            else:
-                following = returns[n, t + 1]
-            returns[n, t] = reward[n, t] + gamma * following
-    return returns
-
-
 def expected(rollout, reward, value, gamma, lmbda):
+    """Advantages, and returns to go, which are values and advantages without a decay."""
     following = rollout["next"]
-    ends = following["done"], following["terminated"]
-    next_value = following[value]
-    advantage = loop_gae(reward, rollout[value], next_value, *ends, gamma, lmbda)
-    return advantage, loop_return_to_go(reward, next_value, *ends, gamma)
+    given = rollout[value], following[value], following["done"], following["terminated"]
+    advantage, undecayed = (loop_gae(reward, *given, gamma, decay) for decay in (lmbda, 1.0))
+    return advantage, rollout[value] + undecayed
 
 
 @pytest.mark.parametrize("precomputed", [False, True])

@@ -14,40 +14,25 @@ from safe_rl.objectives.multipliers import PIDMultiplier, PIMultiplier
 GAINS = {"init": 0.0, "kp": 2.0, "ki": 0.2, "saturation": 1.0, "highest": 5.0}
 
 
-def state(violation, limit=10.0):
-    return LimitState.of(cost=[limit + violation], limit=[limit])
-
-
-def test_two_updates_by_hand():
-    multiplier = PIMultiplier(10.0, **GAINS)
-    multiplier.update(state(5.0))
-    assert multiplier.value.item() == pytest.approx(1.0 + 0.1)
-    # a cost of six times the limit counts as one of twice
-    multiplier.update(state(50.0))
-    assert multiplier.value.item() == pytest.approx(2.0 + 0.3)
-    # and one of nothing as half of the limit, where that is the saturation
-    multiplier = PIMultiplier(10.0, **(GAINS | {"init": 4.0, "saturation": 0.5}))
-    multiplier.update(state(-10.0))
-    assert multiplier.value.item() == pytest.approx(4.0 - 0.1 - 1.0)
-
-
-def test_the_integral_is_not_wound_up_beyond_what_it_can_put_out():
-    multiplier = PIMultiplier(25.0, **GAINS | {"init": 9.0})
-    assert multiplier.value == 5.0
-    for _ in range(200):
-        multiplier.update(state(75.0, limit=25.0))
-    assert multiplier.value == 5.0
-    for _ in range(6):
-        multiplier.update(state(-25.0, limit=25.0))
-    assert multiplier.value == pytest.approx(5.0 - 6 * 0.2 - 2.0)
-
-
-def test_ten_times_the_cost_and_the_limit_give_the_same_multiplier():
-    small, large = PIMultiplier(25.0, **GAINS), PIMultiplier(250.0, **GAINS)
-    for violation in (35.0, 6.0, -13.0, 19.0):
-        small.update(state(violation, limit=25.0))
-        large.update(state(10 * violation, limit=250.0))
-        torch.testing.assert_close(small.value, large.value)
+@pytest.mark.parametrize(
+    ("settings", "costs", "expected"),
+    [
+        ({}, [15.0], 1.0 + 0.1),
+        # A cost of six times the limit counts as one of twice.
+        ({}, [15.0, 60.0], 2.0 + 0.3),
+        # And one of nothing as half of the limit, where that is the saturation.
+        ({"init": 4.0, "saturation": 0.5}, [0.0], 4.0 - 0.1 - 1.0),
+        # The integral is not wound up beyond what it can put out.
+        ({"init": 9.0}, [], 5.0),
+        ({}, [40.0] * 200, 5.0),
+        ({}, [40.0] * 200 + [0.0] * 6, 5.0 - 6 * 0.2 - 2.0),
+    ],
+)
+def test_updates_of_a_pi_by_hand(settings, costs, expected):
+    multiplier = PIMultiplier(10.0, **(GAINS | settings))
+    for cost in costs:
+        multiplier.update(LimitState.of(cost=[cost], limit=[10.0]))
+    assert multiplier.value.item() == pytest.approx(expected)
 
 
 def test_a_limit_of_0_takes_its_unit_from_the_state():

@@ -15,6 +15,11 @@ from safe_rl.objectives import BCLoss, CriticLoss, PPOLoss
 
 SCALED = {"hidden_sizes": [4], "input_scale": torch.tensor([0.1, 1.0, 2.0])}  # a buffer
 ACTOR = {**SCALED, "initial_log_std": -0.5}
+CHANGES = {
+    "copied": copy.deepcopy,
+    "stored": lambda loss: pickle.loads(pickle.dumps(loss)),
+    "moved": lambda loss: loss.double().float(),
+}
 
 
 def make_loss(kind):
@@ -25,14 +30,16 @@ def make_loss(kind):
     return PPOLoss(make_actor(3, 2, **ACTOR), clip_epsilon=0.2, entropy_coeff=0.0)
 
 
+def losses_of(loss, steps):
+    """Always with the same draws."""
+    torch.manual_seed(1)
+    return loss(steps.clone()).detach().to_dict()
+
+
 @pytest.mark.parametrize("kind", [PPOLoss, CriticLoss, BCLoss])
-@pytest.mark.parametrize(
-    "change",
-    [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss)), lambda loss: loss.double()],
-    ids=["copied", "stored", "moved"],
-)
+@pytest.mark.parametrize("change", CHANGES)
 def test_networks_share_the_tensors_of_their_loss(change, kind):
-    loss = change(make_loss(kind))
+    loss = CHANGES[change](make_loss(kind))
     names = ["critic", "cost_critic"] if kind is CriticLoss else ["actor_network"]
     own = {tensor.data_ptr() for tensor in chain(loss.parameters(), loss.buffers())}
     for network in (getattr(loss, name) for name in names):
@@ -41,36 +48,23 @@ def test_networks_share_the_tensors_of_their_loss(change, kind):
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
-@pytest.mark.parametrize(
-    "change",
-    [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss)), lambda x: x.double().float()],
-    ids=["copied", "stored", "moved"],
-)
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_loss_learns_from_its_own_networks_after_it_was(change, kind):
     loss, fresh, steps = *(make_q_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
     loss(steps.clone())
-    (changed := change(loss)).load_state_dict(fresh.state_dict())
-    found = []
-    for module in (changed, fresh):
-        torch.manual_seed(1)
-        found.append(module(steps.clone()).to_dict())
-    torch.testing.assert_close(*found)
+    (changed := CHANGES[change](loss)).load_state_dict(fresh.state_dict())
+    torch.testing.assert_close(losses_of(changed, steps), losses_of(fresh, steps))
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3", "cal"])
 def test_parameters_in_place_of_its_own_are_used_and_no_longer_than_they_are_there(kind):
     loss, fresh, steps = *(make_q_loss(kind, lagrange(1.0, 1.0)) for _ in range(2)), make_steps()
-
-    def found(module):
-        torch.manual_seed(1)
-        return module(steps.clone())["loss_qvalue"].detach()
-
-    before, expected = found(loss), found(fresh)
+    before, expected = (losses_of(each, steps)["loss_qvalue"] for each in (loss, fresh))
     for warm in (True, False):  # whether the loss has been called with its own ones
         loss = loss if warm else copy.deepcopy(loss)
         with TensorDict.from_module(fresh).data.to_module(loss):
-            torch.testing.assert_close(found(loss), expected)
-        torch.testing.assert_close(found(loss), before)
+            torch.testing.assert_close(losses_of(loss, steps)["loss_qvalue"], expected)
+        torch.testing.assert_close(losses_of(loss, steps)["loss_qvalue"], before)
     assert (before - expected).abs() > 1e-4
     loss(steps.clone())["loss_qvalue"].backward()
 
@@ -82,8 +76,5 @@ def test_a_new_loss_with_the_state_of_another_one_needs_no_batch(kind):
     with pytest.raises(ValueError, match=r"not know the scales.*: call prepare\(batch, limits\)"):
         fresh(make_steps())
     fresh.load_state_dict(known.state_dict())
-    steps, found = make_steps(), []
-    for loss in (known, fresh):
-        torch.manual_seed(1)
-        found.append(loss(steps.clone()).to_dict())
-    torch.testing.assert_close(*found)
+    steps = make_steps()
+    torch.testing.assert_close(losses_of(known, steps), losses_of(fresh, steps))

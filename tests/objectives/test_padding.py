@@ -4,19 +4,13 @@ import functools
 
 import pytest
 import torch
-from samples import limit_state, make_actor, make_batch, make_critic, make_rollout
+from samples import TRUST_REGION, limit_state, make_actor, make_batch, make_critic, make_rollout
 from tensordict import TensorDict
 from torchrl.collectors.utils import split_trajectories
 from torchrl.objectives.value import GAE
 
 from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
-from safe_rl.objectives import (
-    CostGAE,
-    CPOLoss,
-    TRPOLoss,
-    VectorGAE,
-    normalise_advantages,
-)
+from safe_rl.objectives import CostGAE, CPOLoss, TRPOLoss, VectorGAE, normalise_advantages
 
 N, T = 3, 20
 SETTINGS = {"gamma": 0.97, "lmbda": 0.9, "value_target": "lambda_return"}
@@ -101,18 +95,17 @@ def test_normalisation():
         torch.testing.assert_close(samples_of(padded, key), flat[key])
 
 
-def make_update(kind, actor):
-    loss = (CPOLoss if kind == "cpo" else TRPOLoss)(actor, entropy_coeff=0.0)
-    if kind == "minibatch":
-        sgd = functools.partial(torch.optim.SGD, lr=0.1)
-        return MinibatchUpdate(loss, optimizer=sgd, num_passes=3, minibatch_size=None)
-    settings = {"target_kl": 0.01, "damping": 0.1, "cg_iterations": 10, "backtrack_coeff": 0.8}
-    if kind == "cpo":
-        return CPOStep(loss, max_backtracks=10, **settings)
-    return TRPOStep(loss, max_backtracks=10, **settings)
+SGD = functools.partial(torch.optim.SGD, lr=0.1)
+PASSES = {"optimizer": SGD, "num_passes": 3, "minibatch_size": None}
+REGION = TRUST_REGION | {"cg_iterations": 10}
+UPDATES = {
+    "minibatch": (MinibatchUpdate, TRPOLoss, PASSES),
+    "trpo": (TRPOStep, TRPOLoss, REGION),
+    "cpo": (CPOStep, CPOLoss, REGION),
+}
 
 
-@pytest.mark.parametrize("kind", ["minibatch", "trpo", "cpo"])
+@pytest.mark.parametrize("kind", UPDATES)
 @pytest.mark.parametrize("key", ["auto", "kept"])
 def test_updates(kind, key):
     results = []
@@ -121,7 +114,8 @@ def test_updates(kind, key):
         actor, *batches = padded_pair()
         if key != "auto":
             batches[1].rename_key_(("collector", "mask"), key)
-        update = make_update(kind, actor)
+        make, loss, settings = UPDATES[kind]
+        update = make(loss(actor, entropy_coeff=0.0), **settings)
         update.loss.loss_mask_key = key
         metrics = update(batches[index], limit_state(-1.0, length=20.0))
         ess = update.loss(batches[index])["ESS"]

@@ -119,8 +119,6 @@ def test_errors_say_what_to_change():
     batch = make_batch(actor, [16])
     with pytest.raises(TypeError, match="use PPOLoss or TRPOLoss"):
         PPOLagrangianLoss(actor, None, **SETTINGS, cost_clipping="none")
-    with pytest.raises(ValueError, match="cost_clipping=both: it must be 'none'"):
-        make_lagrangian(actor, cost_clipping="both")
     loss = make_lagrangian(actor)
     with pytest.raises(ValueError, match="one column per cost limit"):
         loss(batch)
@@ -130,5 +128,3 @@ def test_errors_say_what_to_change():
         loss(batch.clone().set("advantage", torch.zeros(16)))
     with pytest.raises(KeyError, match="Did you mean 'advantages'"):
         loss(batch.clone().rename_key_("advantage", "advantages"))
-    with pytest.raises(ValueError, match="not an accepted tensordict key"):
-        loss.set_keys(costs="cost_advantage")

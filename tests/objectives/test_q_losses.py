@@ -14,12 +14,7 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 from safe_rl.models import make_bounded_actor, make_squashed_actor
-from safe_rl.objectives import (
-    LagrangeMultiplier,
-    SACLagrangianLoss,
-    SACLoss,
-    TD3Loss,
-)
+from safe_rl.objectives import LagrangeMultiplier, SACLagrangianLoss, SACLoss, TD3Loss
 
 
 def as_stock(loss, kind):
@@ -47,46 +42,48 @@ def as_stock(loss, kind):
     return stock
 
 
+def drawn(function, steps, *arguments):
+    """What a function of steps gives, always with the same draws."""
+    torch.manual_seed(1)
+    return function(steps.clone(), *arguments)
+
+
+def value_loss(stock, kind, steps):
+    """TorchRL's loss of the Q functions, and what it reports."""
+    return drawn(stock.value_loss if kind == "td3" else stock.qvalue_v2_loss, steps)
+
+
+@pytest.mark.parametrize("spans", [None, (6,), (6, 1)])
 @pytest.mark.parametrize("kind", ["sac", "td3"])
-def test_an_ensemble_gives_what_torchrl_gives(kind):
+def test_an_ensemble_gives_what_torchrl_gives(kind, spans):
+    """Also of several steps at a time; their number may have a dimension of its own."""
     loss, steps = make_loss(kind), make_steps()
+    if spans is not None:
+        steps["steps_to_next_obs"] = torch.tensor([1, 2, 3, 1, 2, 3]).reshape(spans)
     stock = as_stock(loss, kind)
+    expected, reported = value_loss(stock, kind, steps)
+    torch.manual_seed(1)
+    found = loss.critic_losses(given := steps.clone())
+    torch.testing.assert_close(found["loss_qvalue"], expected)
+    priority = reported["td_error"]
+    if kind == "td3":  # of both networks, and squared
+        priority = priority.max(0).values.sqrt()
+    torch.testing.assert_close(given["td_error"], priority)
+    losses = drawn(loss.actor_losses, steps)["loss_actor"], drawn(stock.actor_loss, steps)[0]
+    torch.testing.assert_close(*losses)
     gradients = []
-    for module in (loss, stock):
-        found = {}
-        for half in ("critic", "actor"):
-            torch.manual_seed(1)
-            given = steps.clone()
-            if module is loss:
-                entries = getattr(loss, f"{half}_losses")(given)
-                found |= given.select("td_error", strict=False).to_dict()  # the priority
-            elif half == "actor":
-                entries = {"loss_actor": stock.actor_loss(given)[0]}
-            elif kind == "td3":
-                entries = {"loss_qvalue": (value := stock.value_loss(given))[0]}
-                found["td_error"] = value[1]["td_error"].max(0).values.sqrt()  # squared in TorchRL
-            else:
-                entries = {"loss_qvalue": (value := stock.qvalue_v2_loss(given))[0]}
-                found["td_error"] = value[1]["td_error"]
-            found |= {k: v for k, v in entries.items() if k in ("loss_qvalue", "loss_actor")}
-        parameters = list(module.actor_network_params.values(True, True))
-        parameters = [p for p in parameters if p.requires_grad]
-        found["gradient"] = torch.cat(
-            [g.flatten() for g in torch.autograd.grad(found["loss_actor"], parameters)]
-        )
-        gradients.append(found)
-    for name, value in gradients[0].items():
-        torch.testing.assert_close(value, gradients[1][name])
+    for module, value in zip((loss, stock), losses, strict=True):
+        parameters = module.actor_network_params.values(True, True)
+        trained = [p for p in parameters if p.requires_grad]
+        gradients.append(torch.autograd.grad(value, trained))
+    torch.testing.assert_close(*gradients)
 
 
 def test_scripts_of_torchrls_td3_find_the_two_losses():
     loss, steps = make_loss("td3"), make_steps()
     stock = as_stock(loss, "td3")
     for name in ("value_loss", "actor_loss"):
-        found = []
-        for module in (loss, stock):
-            torch.manual_seed(1)
-            found.append(getattr(module, name)(steps.clone())[0])
+        found = [drawn(getattr(module, name), steps)[0] for module in (loss, stock)]
         torch.testing.assert_close(*found)
 
 
@@ -99,22 +96,17 @@ def test_parameters_that_get_other_memory_are_those_of_all_losses(kind):
     for network in (loss.qvalue_network, loss.cost_qvalue_network):
         vector = nn.utils.parameters_to_vector(network.parameters())
         nn.utils.vector_to_parameters(3.0 * vector, network.parameters())
-    losses = []
-    for each in (loss, copy.deepcopy(loss)):  # a copy has nothing that was kept
-        torch.manual_seed(1)
-        losses.append(each.actor_losses(steps)["loss_actor"])
-    torch.testing.assert_close(*losses)
+    # a copy has nothing that was kept
+    losses = [drawn(each.actor_losses, steps) for each in (loss, copy.deepcopy(loss))]
+    torch.testing.assert_close(*(each["loss_actor"] for each in losses))
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
 def test_costs_are_weighed_by_their_multipliers_in_units_of_one_cost(kind):
     loss, steps = make_loss(kind, lagrange(2.0, 3.0), pessimism=0.5), make_steps()
     told(loss, [1.0, 0.5], rewards=[-0.25, 0.25])
-    torch.manual_seed(1)
-    found = loss.actor_losses(steps)
-    stock = as_stock(loss, kind)
-    torch.manual_seed(1)
-    reward = stock.actor_loss(steps)[0]
+    found = drawn(loss.actor_losses, steps)
+    reward = drawn(as_stock(loss, kind).actor_loss, steps)[0]
     torch.manual_seed(1)
     if kind == "sac":
         action = loss.actor_network.get_dist(steps).rsample()
@@ -132,11 +124,8 @@ def test_the_size_of_rewards_is_the_deviation_of_all_so_far():
     for batch in rewards.split([50, 150, 100]):
         told(loss, [1.0, 1.0], rewards=batch)
     assert loss.reward_unit.item() == pytest.approx(rewards.numpy().std(), rel=1e-5)
-    loss = make_loss("sac", lagrange(1.0, 1.0))
-    told(
-        loss, [1.0, 1.0], rewards=torch.full((275, 1), 0.1)
-    )  # so many that their sums are not exact
-    assert loss.reward_unit == 1
+    equal = torch.full((275, 1), 0.1)  # so many that their sums are not exact
+    assert told(make_loss("sac", lagrange(1.0, 1.0)), [1.0, 1.0], rewards=equal).reward_unit == 1
 
 
 @pytest.mark.parametrize("kind", ["sac", "td3"])
@@ -185,25 +174,11 @@ def test_nothing_follows_an_end_but_something_a_time_out(kind):
         steps["next", "done"] = torch.ones(6, 1, dtype=torch.bool)
         losses = []
         for _ in range(2):
-            torch.manual_seed(1)
-            losses.append(loss.critic_losses(steps.clone()))
+            losses.append(drawn(loss.critic_losses, steps))
             for target, _ in loss.target_pairs():
                 target.data.add_(0.3)
         for name in ("loss_qvalue", "loss_cost_qvalue"):
             assert torch.equal(losses[0][name], losses[1][name]) is terminated
-
-
-@pytest.mark.parametrize("shape", [(6,), (6, 1)])
-@pytest.mark.parametrize("kind", ["sac", "td3"])
-def test_spans_may_have_a_dimension_of_their_own_as_in_torchrl(kind, shape):
-    loss, steps = make_loss(kind, lagrange(1.0, 1.0)), make_steps()
-    steps["steps_to_next_obs"] = torch.tensor([1, 2, 3, 1, 2, 3]).reshape(shape)
-    stock = as_stock(loss, kind)
-    torch.manual_seed(1)
-    found = loss.critic_losses(steps.clone())
-    torch.manual_seed(1)
-    expected = stock(steps.clone())["loss_qvalue"]
-    torch.testing.assert_close(found["loss_qvalue"], expected)
 
 
 def test_a_critic_that_is_no_ensemble_and_multipliers_of_other_costs_are_refused():
@@ -249,12 +224,12 @@ def test_a_minibatch_that_fails_leaves_the_policy_its_parameters():
 def test_the_smoothing_of_td3_is_of_the_range_of_actions():
     low, high = torch.tensor([-0.4, -2.0]), torch.tensor([0.4, 2.0])
     actor = make_bounded_actor(3, low, high, hidden_sizes=[8])
-    loss = TD3Loss(actor, make_q(), **TD3 | {"action_spec": Bounded(low, high)})
+    settings = TD3 | {"action_spec": Bounded(low, high), "policy_noise": 1.0}
+    loss = TD3Loss(actor, make_q(), **settings)
     steps = make_steps()
+    found = drawn(loss.smoothed_action, steps)
     torch.manual_seed(1)
-    found = loss.smoothed_action(steps)
-    torch.manual_seed(1)
-    noise = (0.2 * torch.randn(6, 2)).clamp(-0.5, 0.5) * high
+    noise = torch.randn(6, 2).clamp(-0.5, 0.5) * high
     torch.testing.assert_close(found, (actor(steps)["action"] + noise).clamp(low, high))
     # what a resumed run is given is not replaced by what it was before
     assert not [name for name in loss.state_dict() if "noise" in name]
@@ -273,16 +248,12 @@ def test_the_value_estimator_that_one_asks_for_is_used(kind, given):
         else:
             average = {"average_rewards": True} if given == "averaged" else {}
             module.make_value_estimator(ValueEstimators.TD0, gamma=0.25, **average)
-    torch.manual_seed(1)
-    rewards = (stock.value_loss if kind == "td3" else stock.qvalue_v2_loss)(steps.clone())[0]
-    torch.manual_seed(1)
-    losses = loss.critic_losses(steps.clone())
-    torch.testing.assert_close(losses["loss_qvalue"], rewards)
+    losses = drawn(loss.critic_losses, steps)
+    torch.testing.assert_close(losses["loss_qvalue"], value_loss(stock, kind, steps)[0])
     expected = make_loss(kind, lagrange(1.0, 1.0))
     expected.load_state_dict(loss.state_dict())
     expected.gamma = 0.25
-    torch.manual_seed(1)
-    costs = expected.critic_losses(steps.clone())["loss_cost_qvalue"]
+    costs = drawn(expected.critic_losses, steps)["loss_cost_qvalue"]
     torch.testing.assert_close(losses["loss_cost_qvalue"], costs)
 
 

@@ -4,17 +4,11 @@ import pytest
 import torch
 from point_mass import PointMass
 from samples import TRUST_REGION, limit_state
-from tensordict.nn import (
-    AddStateIndependentNormalScale,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictSequential,
-)
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule, TensorDictSequential
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 from torchrl.envs import Compose, InitTracker, TransformedEnv
-from torchrl.modules import IndependentNormal, LSTMModule, set_recurrent_mode
+from torchrl.modules import IndependentNormal, LSTMModule, ProbabilisticActor, set_recurrent_mode
 
 from safe_rl.algorithms import TRPOStep
 from safe_rl.collectors import make_collector
@@ -40,12 +34,11 @@ def collected():
     """An actor, a critic, and a batch that both have stepped: episodes of 20 in rows of 50."""
     acting, valuing = remembering("acting"), remembering("valuing")
     head = nn.Sequential(nn.Linear(6, 2), AddStateIndependentNormalScale(2))
-    actor = ProbabilisticTensorDictSequential(
-        *acting,
-        TensorDictModule(head, ["acting"], ["loc", "scale"]),
-        ProbabilisticTensorDictModule(
-            ["loc", "scale"], ["action"], distribution_class=IndependentNormal, return_log_prob=True
-        ),
+    actor = ProbabilisticActor(
+        TensorDictSequential(*acting, TensorDictModule(head, ["acting"], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
     )
     value = TensorDictModule(nn.Linear(6, 1), ["valuing"], ["state_value"])
     critic = TensorDictSequential(*valuing, value)
