@@ -5,7 +5,7 @@ import signal
 import subprocess
 import time
 from functools import partial
-from multiprocessing import active_children
+from multiprocessing import active_children, parent_process
 from threading import Thread
 
 import point_mass
@@ -161,40 +161,31 @@ def test_what_keeps_workers_from_starting_is_told():
     collector.shutdown()
 
 
-class Troubled:
-    """Makes environments, but in a worker something happens to it."""
-
-    def __init__(self, trouble):
-        self.trouble = trouble
-        self.home = os.getpid()
-
-    def __call__(self, *, num_envs):
-        if os.getpid() != self.home:
-            self.trouble()
-        return MAKE(num_envs=num_envs)
-
-
-def end():
-    os._exit(9)
-
-
 def fail():
     raise MemoryError("too many worlds")
 
 
+def make_in_trouble(trouble, *, num_envs):
+    """An environment, but in a worker something happens."""
+    if parent_process() is not None:
+        trouble()
+    return MAKE(num_envs=num_envs)
+
+
 def collect_in_trouble(trouble):
     """Run by a process of its own, which has to end as well."""
-    next(iter(collect(Troubled(trouble), num_collectors=1)[0]))
+    next(iter(collect(partial(make_in_trouble, trouble), num_collectors=1)[0]))
 
 
 SCRIPT = """
-import sys
+import os, sys
+from functools import partial
 sys.path[:0] = {path!r}
 import safe_rl
 import test_workers
 if __name__ == "__main__":
     try:
-        test_workers.collect_in_trouble(test_workers.end)
+        test_workers.collect_in_trouble(partial(os._exit, 9))
     except Exception as error:
         print(error)
     test_workers.collect_in_trouble(test_workers.fail)
