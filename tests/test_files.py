@@ -9,27 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from safe_rl.files import (
-    check_no_links,
-    load_tensors,
-    read_bounded,
-    read_config,
-    read_json,
-    read_yaml,
-    replacing,
-    save_tensors,
-)
+from safe_rl import files
+from safe_rl.files import read_config, read_json, read_yaml, replacing
 from safe_rl.reporting import archive
 from safe_rl.runs import table
 from safe_rl.runs.folder import paths_below
 from safe_rl.runs.run import Run, find_runs
 
+NUMBERS = st.booleans() | st.integers() | st.floats(allow_nan=False)
 VALUES = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats(allow_nan=False)
-    | st.text("abe -+:#'10_."),
+    st.none() | NUMBERS | st.text("abe -+:#'10_."),
     lambda inner: st.lists(inner) | st.dictionaries(st.text("abc", min_size=1), inner),
 )
 
@@ -127,9 +116,9 @@ def test_a_table_of_any_size_and_a_pipe_are_not_read(tmp_path):
         _ = Run(tmp_path).num_rows
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe is no regular file"):
-        read_bounded(tmp_path / "pipe")
+        files.read_bounded(tmp_path / "pipe")
     with pytest.raises(ValueError, match="pipe is no regular file"):
-        check_no_links(tmp_path)
+        files.check_no_links(tmp_path)
 
 
 def test_what_unpacks_to_more_than_an_archive_has_is_refused(tmp_path, monkeypatch):
@@ -177,7 +166,7 @@ def test_a_hint_does_not_search_a_whole_disk(tmp_path, monkeypatch):
 def test_tensors_of_a_device_that_is_missing_here_are_read_into_main_memory(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("torch.serialization.location_tag", lambda storage: "cuda:1")
-        save_tensors(tmp_path / "state.pt", {"x": torch.ones(2)})
+        files.save_tensors(tmp_path / "state.pt", {"x": torch.ones(2)})
     for name, value in (("is_available", True), ("device_count", 1)):
         monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
-    assert load_tensors(tmp_path / "state.pt")["x"].device.type == "cpu"
+    assert files.load_tensors(tmp_path / "state.pt")["x"].device.type == "cpu"

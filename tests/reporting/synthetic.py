@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from safe_rl.cli.report import suite
@@ -32,7 +33,7 @@ EVALUATION = {
 
 
 def grouped(root: Path):
-    """Experiments below a folder, and what was left out for being a repetition."""
+    """Experiments below a folder, and the repetitions that were left out."""
     runs, _ = read_runs(root)
     return group_runs(runs, SUITE)
 
@@ -61,9 +62,10 @@ def write_run(
     algo: str = "ppo",
     seed: int = 0,
     *,
-    returns=(1.0,),
-    costs=(30.0,),
-    rates=(0.03,),
+    epochs=1,
+    returns=1.0,
+    costs=30.0,
+    rates=0.03,
     frames: int | None = None,
     env_changes: dict | None = None,
     limits: dict | None = None,
@@ -72,17 +74,22 @@ def write_run(
     columns: dict | None = None,
     **settings,
 ) -> Path:
-    """One row of the table per entry of `returns`, 1000 steps and 3.6 s apart.
+    """One row of the table per epoch, 1000 steps and 3.6 s apart.
 
-    `columns` are further ones, by name; those of limited costs are there.
+    `returns`, `costs` and `rates` are of one epoch each, or a number for all of them. `columns` are
+    further ones, by name; those of limited costs are there.
     """
+    epochs = max([epochs, *(np.size(values) for values in (returns, costs, rates))])
+    returns, costs, rates = (
+        [values] * epochs if np.isscalar(values) else values for values in (returns, costs, rates)
+    )
     directory = root / env / algo / (folder or f"seed{seed}")
     (directory / ".hydra").mkdir(parents=True)
     config = {
         "env": {**SUITE.environments.get(env, {"name": env}), **(env_changes or {})},
         "algo": {"name": algo},
         "seed": seed,
-        "frames": 1000 * len(returns) if frames is None else frames,
+        "frames": 1000 * epochs if frames is None else frames,
         "cost_limits": {"cost": 25.0} if limits is None else limits,
         "preset": "default",
         "device": "cpu",

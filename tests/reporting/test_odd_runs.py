@@ -12,7 +12,6 @@ from safe_rl.files import printable
 from safe_rl.reporting import ReportOptions, build_report
 
 SECRET = "hush-hush"
-EPOCHS = {"returns": (1.0, 2.0), "costs": (30.0, 20.0), "rates": (0.03, 0.02)}
 
 
 def change(run, **changes):
@@ -90,17 +89,16 @@ UNUSUAL = {
 def report(tmp_path, damages):
     """A report of a good run and one for every damage: runs by folder, what was left out, files."""
     root = tmp_path / "runs"
-    write_run(root, folder="good", **EPOCHS)
+    write_run(root, folder="good", epochs=2)
     for number, damage in enumerate(damages):
-        damage(write_run(root, seed=number + 1, folder=f"odd{number}", **EPOCHS))
+        damage(write_run(root, seed=number + 1, folder=f"odd{number}", epochs=2))
     assert main([str(root), "seeds=1"]) == 0
     found = build_report(root, SUITE, ReportOptions(seeds=1))
     texts = [path.read_bytes() for path in (root / "report").iterdir()]
     assert not any(SECRET.encode() in text for text in texts)
     html = (root / "report/report.html").read_text()
-    assert all(
-        link.startswith(("data:", "#")) for link in re.findall(r'(?:src|href)="([^"]*)"', html)
-    )
+    links = re.findall(r'(?:src|href)="([^"]*)"', html)
+    assert all(link.startswith(("data:", "#")) for link in links)
     assert "<script" not in html
     return {run.directory.name: run for run in found.runs}, found.skipped
 

@@ -12,7 +12,7 @@ from safe_rl.reporting.figures import add_legend, algorithm_styles, fronts
 from safe_rl.reporting.scoring import final_table
 from safe_rl.runs.curves import save_figure
 
-ROWS = {"returns": (1.0, 2.0, 3.0), "rates": (0.06, 0.05, 0.04)}
+ROWS = {"returns": (1.0, 2.0, 3.0)}
 
 
 def learning_pictures(experiments):
@@ -21,12 +21,11 @@ def learning_pictures(experiments):
 
 
 def test_panels_have_means_intervals_and_limits(tmp_path):
-    for seed, shift in ((0, 0.0), (10, 6.0)):
-        costs = [30.0 + shift] * 3
-        write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=costs)
-    write_run(tmp_path, "PointGoal2", "cpo", 0, **ROWS, costs=(1, 1, 1), limits={"cost": 10.0},
-              env_changes={"num_steps": 500}, frames=10**6)  # fmt: skip
-    write_run(tmp_path, "PointPush1", "trpo", returns=[np.nan], costs=[np.nan], rates=[3])
+    for seed, cost in ((0, 30.0), (10, 36.0)):
+        write_run(tmp_path, "PointGoal1", "ppo", seed, **ROWS, costs=cost)
+    shorter = {"env_changes": {"num_steps": 500}, "limits": {"cost": 10.0}}
+    write_run(tmp_path, "PointGoal2", "cpo", **ROWS, **shorter, frames=10**6)
+    write_run(tmp_path, "PointPush1", "trpo", returns=np.nan, costs=np.nan)
     experiments = experiments_in(tmp_path)
     (figure,) = learning_pictures(experiments)
     panels = np.array(figure.axes).reshape(3, 3)
@@ -51,12 +50,12 @@ def test_panels_have_means_intervals_and_limits(tmp_path):
 def test_the_figures_of_the_paper_show_what_is_missing(tmp_path):
     for env in ("PointGoal2", "PointButton1", "PointButton2"):
         for seed in (0, 10):
-            write_run(tmp_path, env, "cpo", seed, **ROWS, costs=[20.0] * 3, frames=3000)
+            write_run(tmp_path, env, "cpo", seed, epochs=3, costs=20.0)
     # other lengths, variants with fewer seeds, and other algorithms are left out
-    write_run(tmp_path, "PointButton1", "cpo", 0, **ROWS, costs=[90.0] * 3, frames=2000, folder="a")
-    write_run(tmp_path, "PointButton1", "cpo", 0, **ROWS, costs=[90.0] * 3, frames=3000, folder="b",
-              model={"width": 9})  # fmt: skip
-    write_run(tmp_path, "PointGoal2", "focops", **ROWS, costs=[90.0] * 3, frames=3000)
+    other = {"epochs": 3, "costs": 90.0}
+    write_run(tmp_path, "PointButton1", "cpo", **other, frames=2000, folder="a")
+    write_run(tmp_path, "PointButton1", "cpo", **other, folder="b", model={"width": 9})
+    write_run(tmp_path, "PointGoal2", "focops", **other)
     (drawing,) = benchmark_figures(experiments_in(tmp_path), 12.0)
     assert drawing.name == "figure_7"
     panels = np.array(drawing.figure.axes).reshape(3, 6)
@@ -71,7 +70,7 @@ def test_the_figures_of_the_paper_show_what_is_missing(tmp_path):
 
 
 def test_every_limited_cost_has_a_row(tmp_path):
-    hazards = {"episode_cost_hazards": (4,), "cost_hazards_rate": (0.004,)}
+    hazards = {"episode_cost_hazards": [4], "cost_hazards_rate": [0.004]}
     write_run(tmp_path, limits={"cost": 25.0, "cost_hazards": 5.0}, columns=hazards)
     experiments = experiments_in(tmp_path)
     (figure,) = learning_pictures(experiments)
@@ -105,7 +104,7 @@ def test_an_algorithm_has_one_look_everywhere_that_no_other_one_has(tmp_path):
 def test_experiments_of_one_algorithm_are_told_apart(tmp_path):
     for width in range(15):
         model = {"model": {"width": width}, "frames": 3000}
-        write_run(tmp_path, algo="cpo", **model, **ROWS, costs=(1, 1, 1), folder=f"w{width}")
+        write_run(tmp_path, algo="cpo", **model, epochs=3, folder=f"w{width}")
         write_run(tmp_path, algo="cpo", **model, seed=1, folder=f"unfinished{width}")
     experiments = experiments_in(tmp_path)
     styles = algorithm_styles(experiments).values()
@@ -147,8 +146,8 @@ def front_panels(experiments):
 
 def test_the_front_joins_what_no_other_one_beats(tmp_path):
     for algo, value, cost in (("ppo", 20.0, 60.0), ("cpo", 10.0, 20.0), ("trpo", 5.0, 40.0)):
-        write_run(tmp_path, algo=algo, returns=[value], costs=[cost])
-    write_run(tmp_path, algo="cpo", returns=[3.0], costs=[8.0], limits={"cost": 9.0}, folder="9")
+        write_run(tmp_path, algo=algo, returns=value, costs=cost)
+    write_run(tmp_path, algo="cpo", returns=3.0, costs=8.0, limits={"cost": 9.0}, folder="9")
     experiments = experiments_in(tmp_path)
     (axis,) = front_panels(experiments)
     front = next(line for line in axis.lines if line.get_color() == "0.7")
@@ -167,8 +166,7 @@ def test_the_front_joins_what_no_other_one_beats(tmp_path):
 
 def test_fronts_join_nothing_that_was_trained_for_longer(tmp_path):
     for algo, epochs in (("ppo", 1), ("cpo", 1), ("trpo", 3), ("ppo_lagrangian", 3), ("mine", 9)):
-        rows = {name: [1.0] * epochs for name in ("returns", "costs", "rates")}
-        write_run(tmp_path, algo=algo, **rows, limits={} if algo == "ppo" else None)
+        write_run(tmp_path, algo=algo, epochs=epochs, limits={} if algo == "ppo" else None)
     experiments = experiments_in(tmp_path)
     shown = {axis.get_title(): axis for axis in front_panels(experiments) if axis.get_title()}
     assert list(shown) == ["PointGoal1, 1k steps", "PointGoal1, 3k steps"]

@@ -15,6 +15,12 @@ def names(experiments):
     return [(e.environment, e.algorithm, [run.seed for run in e.runs]) for e in experiments]
 
 
+def note_sources(directory, *sources, **others):
+    """Folders of configurations, as Hydra notes them."""
+    record = {"hydra": {"runtime": {"config_sources": sources}, **others}}
+    (directory / ".hydra/hydra.yaml").write_text(json.dumps(record))
+
+
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "algo").glob("*.yaml")))
 def test_every_algorithm_has_the_name_that_the_field_gives_it(name):
     title = title_of(name)
@@ -40,7 +46,7 @@ def test_seeds_of_one_configuration_are_one_experiment(tmp_path):
 
 def test_a_run_knows_its_command_and_its_end(tmp_path):
     said = ["env=PointGoal1", "cost_limits={cost: 10}", "seed=0"]
-    write_run(tmp_path, returns=(1.0, 2.0), costs=(1, 1), rates=(0, 0), overrides=said)
+    write_run(tmp_path, epochs=2, overrides=said)
     write_run(tmp_path, seed=1, frames=9000)
     (tmp_path / "PointGoal1/ppo/seed1/.hydra/overrides.yaml").unlink()
     write_run(tmp_path, seed=2, overrides=[])
@@ -58,8 +64,7 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
         {"path": "/home/me/conf", "provider": "main"},
         {"path": "/home/me/my conf", "provider": "command-line"},
     ]
-    record = {"hydra": {"runtime": {"config_sources": sources}, "run": {"dir": "${oc.env:HOME}"}}}
-    (run / ".hydra/hydra.yaml").write_text(json.dumps(record))
+    note_sources(run, *sources, run={"dir": "${oc.env:HOME}"})
     (run / ".hydra/config.yaml").write_text("{frames: 500, device: cuda, model: {sizes: [8]}}")
     # it was continued to 1000, and with other sizes
     config = yaml.safe_load((run / "config.yaml").read_text()) | {"model": {"sizes": [16]}}
@@ -74,26 +79,20 @@ def test_a_command_has_what_the_overrides_do_not_say(tmp_path):
     assert read_runs(tmp_path)[0][0].repeating == "python train.py env=PointGoal1 frames=500 seed=0"
 
 
-def test_names_have_what_a_file_of_the_users_or_resuming_has_changed(tmp_path):
+@pytest.mark.parametrize("kind", ["of a file", "continued"])
+def test_names_have_what_a_file_of_the_users_or_resuming_has_changed(tmp_path, kind):
     """As in `+experiment=mine loss.clip=0.1`, whose command line has one of two differences."""
     plain = {"loss": {"clip": 0.2}, "policy_update": {"max_kl": 0.01}}
     changed = {"loss": {"clip": 0.1}, "policy_update": {"max_kl": 0.05}}
     write_run(tmp_path, algo="mine", folder="plain", **plain)
-    of_file, continued = (
-        write_run(tmp_path, algo="mine", folder=name, overrides=["loss.clip=0.1"], **changed)
-        for name in ("file", "continued")
-    )
+    run = write_run(tmp_path, algo="mine", folder=kind, overrides=["loss.clip=0.1"], **changed)
     assert [name for _, name, _ in names(grouped(tmp_path)[0])] == ["mine", "mine (loss.clip=0.1)"]
-    source = {"path": "/home/me/conf", "provider": "command-line"}
-    record = {"hydra": {"runtime": {"config_sources": [source]}}}
-    (of_file / ".hydra/hydra.yaml").write_text(json.dumps(record))
-    (continued / ".hydra/config.yaml").write_text(json.dumps(plain | {"loss": changed["loss"]}))
-    for folder in (of_file, continued):
-        others = continued if folder is of_file else of_file
-        kept = others.rename(tmp_path.with_name(f"{tmp_path.name}_kept"))
-        _, (_, name, _) = names(grouped(tmp_path)[0])
-        assert name == "mine (loss.clip=0.1, policy_update.max_kl=0.05)"
-        kept.rename(others)
+    if kind == "of a file":
+        note_sources(run, {"path": "/home/me/conf", "provider": "command-line"})
+    else:
+        (run / ".hydra/config.yaml").write_text(json.dumps(plain | {"loss": changed["loss"]}))
+    _, (_, name, _) = names(grouped(tmp_path)[0])
+    assert name == "mine (loss.clip=0.1, policy_update.max_kl=0.05)"
 
 
 def test_what_is_no_run_is_named_with_its_reason(tmp_path):
@@ -135,8 +134,7 @@ def test_without_any_run_there_is_an_error_with_the_reasons(tmp_path):
 
 
 def test_of_the_same_run_twice_the_one_that_came_further_is_kept(tmp_path):
-    rows = {"returns": (1.0, 2.0), "costs": (1, 1), "rates": (0, 0)}
-    longer = write_run(tmp_path, **rows, frames=2000, folder="longer")
+    longer = write_run(tmp_path, epochs=2, folder="longer")
     shorter = write_run(tmp_path, frames=2000, folder="shorter")
     newer = write_run(tmp_path, seed=1, frames=2000, folder="2026-02-01_12-00-00_seed1")
     # written last, as files of a clone are in any order

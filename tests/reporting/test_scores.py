@@ -32,7 +32,9 @@ def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
     assert record["cost_rate"] == pytest.approx(0.021)
     assert record["cost_rate_std"] == pytest.approx(7**0.5 / 1000)
     assert (record["seeds"], record["steps"], record["satisfies"]) == (3, 7000, True)
-    (row,) = final_table([experiment]).rows()
+    table = final_table([experiment])
+    assert list(table.columns)[-2:] == ["paper, 10M steps", "later work, 10M steps"]
+    (row,) = table.rows()
     assert [cell.text for cell in row] == [
         "PPO", "21.0\xa0± 2.6", "25", "11.00\xa0± 2.65", "0.0210\xa0± 0.0026", "3", "7,000",
         "25.49 / 54.218 / 0.054", "33.4 / 58.1",
@@ -41,11 +43,10 @@ def test_final_scores_are_means_and_deviations_over_seeds(tmp_path):
 
 def test_the_bias_of_critics_is_that_of_the_final_epochs(tmp_path):
     biases = {"critic_bias_cost": [900.0, *[4.0, "", 6.0, 4.0, 6.0]]}
-    rows = {name: [1.0] * 6 for name in ("returns", "costs", "rates")}
-    write_run(tmp_path, algo="cpo", columns=biases, **rows)
+    write_run(tmp_path, algo="cpo", columns=biases, epochs=6)
     biases = {"critic_bias_cost": [0.0] * 5 + [5.0]}
-    write_run(tmp_path, algo="cpo", seed=1, columns=biases, **rows)
-    write_run(tmp_path, algo="ppo", **rows)
+    write_run(tmp_path, algo="cpo", seed=1, columns=biases, epochs=6)
+    write_run(tmp_path, algo="ppo", epochs=6)
     table = final_table(experiments_in(tmp_path))
     place = list(table.columns).index("critics' bias")
     assert [row[place].text for row in table.rows()] == ["—", "+3.0"]  # of 5 and 1
@@ -66,17 +67,16 @@ def test_published_values_stand_only_beside_what_they_are_values_of(tmp_path):
 
 
 def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
-    for algo, values in {
-        "ppo": (20.0, 60.0, 0.06),
-        "ppo_lagrangian": (10.0, 25.0, 0.02),
-        "trpo_lagrangian": (10.0, 20.0, 0.03),
-        "cpo": (12.0, 24.0, 0.04),
-    }.items():
-        returns, costs, rates = ([value] for value in values)
-        write_run(tmp_path, algo=algo, returns=returns, costs=costs, rates=rates)
+    for algo, value, cost, rate in (
+        ("ppo", 20.0, 60.0, 0.06),
+        ("ppo_lagrangian", 10.0, 25.0, 0.02),
+        ("trpo_lagrangian", 10.0, 20.0, 0.03),
+        ("cpo", 12.0, 24.0, 0.04),
+    ):
+        write_run(tmp_path, algo=algo, returns=value, costs=cost, rates=rate)
     # other limits are another problem
-    write_run(tmp_path, algo="trpo", returns=[90.0], limits={"cost": 50.0})
-    write_run(tmp_path, algo="mine", returns=[99.0], costs=[60.0], limits={})
+    write_run(tmp_path, algo="trpo", returns=90.0, limits={"cost": 50.0})
+    write_run(tmp_path, algo="mine", returns=99.0, costs=60.0, limits={})
     table = final_table(experiments_in(tmp_path))
     assert [row["$d$"] for row in texts_of(table)] == ["25", "25", "50", "25", "25", "—"]
     assert marks(table, "$J_c$") == ["bad", "", "", "", "", ""]
@@ -86,9 +86,9 @@ def test_the_best_is_sought_among_those_that_keep_their_limits(tmp_path):
 
 def test_seeds_that_have_not_come_equally_far_are_not_ranked_with_those_that_have(tmp_path):
     """Where unfinished runs are to count, the longest of an experiment does not stand for all."""
-    long = {name: [1.0] * 10 for name in ("returns", "costs", "rates")}
+    long = {"epochs": 10, "costs": 1.0}
     write_run(tmp_path, algo="cpo", **long)
-    write_run(tmp_path, algo="cpo", seed=10, returns=[9.0], frames=10_000)
+    write_run(tmp_path, algo="cpo", seed=10, returns=9.0, frames=10_000)
     for seed in (0, 10):
         for algo in ("trpo_lagrangian", "ppo_lagrangian"):
             write_run(tmp_path, algo=algo, seed=seed, **long)
@@ -108,25 +108,15 @@ def test_seeds_that_have_not_come_equally_far_are_not_ranked_with_those_that_hav
     assert list(states.values()).count("finished") == 5
 
 
-def test_published_values_say_after_how_many_steps(tmp_path):
-    write_run(tmp_path)
-    (experiment,) = experiments_in(tmp_path)
-    note = slate_table("SG6", [[experiment]]).note
-    assert "10,000,000 (Doggo: 100,000,000 steps)" in note
-    titles = list(final_table([experiment]).columns)[-2:]
-    assert titles == ["paper, 10M steps", "later work, 10M steps"]
-
-
 def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
-    epochs = {"returns": [1.0] * 7, "rates": [0.01] * 7}
     # mean costs that keep d = 25 and a measure that does not, and the other way round
     over = {"violation_cost": [-900, -900, "", 9, 11, "", 10]}
     below = {"violation_cost": [900, 900, -4, -6, "", "", ""]}
     risk = {"_target_": "safe_rl.objectives.CVaR"}
-    write_run(tmp_path, algo="mine", **epochs, costs=[10.0] * 7, columns=over, risk=risk)
-    write_run(tmp_path, algo="yours", **epochs, costs=[40.0] * 7, columns=below, risk=risk)
+    write_run(tmp_path, algo="mine", epochs=7, costs=10.0, columns=over, risk=risk)
+    write_run(tmp_path, algo="yours", epochs=7, costs=40.0, columns=below, risk=risk)
     # limits=paper: an estimate of the mean from rows shorter than episodes is no other measure
-    write_run(tmp_path, algo="cpo", **epochs, costs=[10.0] * 7, columns=over)
+    write_run(tmp_path, algo="cpo", epochs=7, costs=10.0, columns=over)
     experiments = experiments_in(tmp_path)
     records = {e.algorithm: final_record(e, ["cost"]) for e in experiments}
     found = {name: (r["excess_cost"], r["satisfies"]) for name, r in records.items()}
@@ -144,8 +134,7 @@ def test_a_limit_on_another_measure_is_judged_by_that_measure(tmp_path):
 
 def test_a_limit_that_the_published_ppo_keeps_has_no_normalised_violation(tmp_path):
     for name, limit in (("cpo", 25.0), ("ppo", REFERENCE["PointGoal1"].episode_cost)):
-        rows = {"returns": [1.0], "costs": [limit + 1], "rates": [0.1]}
-        write_run(tmp_path, algo=name, **rows, limits={"cost": limit})
+        write_run(tmp_path, algo=name, costs=limit + 1, limits={"cost": limit})
     ((_, members),) = complete_slates(experiments_in(tmp_path), 1)
     assert [e.algorithm for (e,) in members] == ["CPO"]
 
@@ -158,9 +147,9 @@ def write_slate(root, algo, multiples):
             factor = multiples[index] + shift
             write_run(
                 root, env, algo, seed,
-                returns=[factor * reference.episode_return],
-                costs=[25 + factor * (reference.episode_cost - 25)],
-                rates=[factor * reference.cost_rate],
+                returns=factor * reference.episode_return,
+                costs=25 + factor * (reference.episode_cost - 25),
+                rates=factor * reference.cost_rate,
             )  # fmt: skip
 
 
@@ -174,6 +163,7 @@ def test_a_complete_slate_is_averaged_over_environments_and_seeds(tmp_path):
     assert (name, [e.benchmark for e in members[0]]) == ("SG6", list(SLATES["SG6"]))
     assert [name for name, _ in complete_slates(experiments, 4)] == ["shared"]
     table = slate_table(name, members)
+    assert "10,000,000 (Doggo: 100,000,000 steps)" in table.note
     (record,) = table.records
     scores = [record[score] for score in ("episode_return", "violation", "cost_rate")]
     assert scores == pytest.approx([1.0, 1.0, 1.0])
@@ -210,14 +200,14 @@ def test_what_counts_towards_no_slate(changes, tmp_path):
 
 
 def test_what_has_finished_no_episode_is_neither_best_nor_worse_than_others(tmp_path):
-    nothing = [float("nan")]
+    nothing = float("nan")
     for seed in (0, 10):
         write_run(tmp_path, algo="ppo", seed=seed, returns=nothing, costs=nothing, limits={})
         write_run(tmp_path, algo="trpo", seed=seed, limits={})
-        write_run(tmp_path, algo="trpo_lagrangian", seed=seed, returns=[0.5 + seed], limits={})
+        write_run(tmp_path, algo="trpo_lagrangian", seed=seed, returns=0.5 + seed, limits={})
         write_run(tmp_path, algo="cpo", seed=seed, returns=nothing, costs=nothing)
-        write_run(tmp_path, algo="ppo_lagrangian", seed=seed, returns=[2.0 + seed], costs=[20.0])
-        write_run(tmp_path, algo="mine", seed=seed, returns=[2.0 + seed], costs=[90.0])
+        write_run(tmp_path, algo="ppo_lagrangian", seed=seed, returns=2.0 + seed, costs=20.0)
+        write_run(tmp_path, algo="mine", seed=seed, returns=2.0 + seed, costs=90.0)
     experiments = experiments_in(tmp_path)
     table = final_table(experiments)
     found = dict(zip((r["algorithm"] for r in table.records), marks(table, "$J_r$"), strict=True))
@@ -235,12 +225,11 @@ def test_the_papers_tables_have_what_there_is_beside_the_published_values(tmp_pa
         for algo, factor in (("ppo", 1.0), ("cpo", 0.5), ("trpo_lagrangian", 0.5)):
             cost = scores.episode_cost if algo == "ppo" else 20.0
             rate = scores.cost_rate * (factor if algo != "cpo" else 0.6)
-            rows = {"returns": [factor * scores.episode_return], "costs": [cost], "rates": [rate]}
-            write_run(tmp_path, env, algo, **rows)
+            value = factor * scores.episode_return
+            write_run(tmp_path, env, algo, returns=value, costs=cost, rates=rate)
     # twice as long, it dominates nothing, and neither does one with another limit
-    better = {"returns": [99.0] * 2, "costs": [20.0] * 2, "rates": [0.0] * 2}
-    write_run(tmp_path, algo="ppo_lagrangian", **better)
-    write_run(tmp_path, algo="trpo", returns=[99.0], limits={"cost": 50.0})
+    write_run(tmp_path, algo="ppo_lagrangian", epochs=2, returns=99.0, costs=20.0, rates=0.0)
+    write_run(tmp_path, algo="trpo", returns=99.0, limits={"cost": 50.0})
     for env in {*SLATES["SGCar"]} - {"CarGoal2"}:
         write_run(tmp_path, env, "ppo")
     rows = texts_of(paper_table(experiments_in(tmp_path)))
