@@ -82,11 +82,7 @@ def test_no_value_ends_in_a_traceback():
         ("limits.free_steps", [], "limits.free_steps=[]: it must be"),
         ("seed", True, "Value 'True' of type 'bool' could not be converted to Integer"),
         ("advantage.gamma", 2, "advantage.gamma=2: it must be less than or equal to 1"),
-        (
-            "advantage.gama",
-            2,
-            "advantage.gama: VectorGAE has no such argument. Did you mean 'gamma'",
-        ),
+        ("advantage.gama", 2, "gama: VectorGAE has no such argument. Did you mean 'gamma'"),
         ("policy_update.adapt_rate.factor", 1, "adapt_rate.factor=1: it must be greater than 1"),
         ("lagrangian.init", True, "lagrangian.init=true: it must be"),
         ("policy_update.optimizer.lr", -1, "policy_update: Invalid learning rate: -1"),

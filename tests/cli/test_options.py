@@ -7,19 +7,14 @@ import re
 import sys
 from dataclasses import fields
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from safe_rl.checks import SettingError
 from safe_rl.cli.evaluate import main as evaluate_main
-from safe_rl.cli.options import (
-    keep_streams,
-    make_options,
-    read_options,
-    run_command,
-    usage,
-)
+from safe_rl.cli.options import keep_streams, make_options, read_options, run_command, usage
 from safe_rl.evaluation.settings import EvaluationOptions
 from safe_rl.extras import import_extra
 
@@ -106,10 +101,7 @@ def test_an_error_within_a_package_is_not_taken_for_its_absence(tmp_path, monkey
 
 def test_an_error_cannot_control_the_terminal(capsys):
     """Names in checkpoints and robots' files of other people are part of messages."""
-
-    def fail(*arguments):
-        raise ValueError("a robot named \x1b]0;mine\x07")
-
+    fail = Mock(side_effect=ValueError("a robot named \x1b]0;mine\x07"))
     assert run_command(fail, ["run"], "safe-rl evaluate RUN", EvaluationOptions) == 1
     assert capsys.readouterr().err == "error: a robot named ?]0;mine?\n"
 

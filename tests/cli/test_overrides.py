@@ -21,6 +21,8 @@ RIGHT = [
     ["-m", "import=json", "seed=0,1", "--config-dir", "conf"],
     ["import=json", "--config-dir=conf", "env=PointGoal1", "seed=3"],
     ["algo=cpo", "-m", "seed=0,1", "--config-dir", "conf", "env=CarGoal1"],
+    ["algo=cpo", "risk=cvar"],
+    ["algo=ppo", "risk=chance", "transforms=[saute]"],  # which is certified
 ]
 WRONG = {
     "env.hazard_num=3": r"^there is no key 'env.hazard_num'\. Did you mean 'env.hazards_num'\?$",
@@ -57,12 +59,28 @@ WRONG = {
     "note={a: A (b)}": r"cannot be read.* need quotes: \"labels={a: 'A \(b\)'}\"\.$",
     "init_from=my run (1)": r"cannot be read.*quotes: \"init_from='my run \(1\)'\"\.$",
 }
-MINE = """
-# @package _global_
-algo: {tail: 0.25, weight: 1.0}  # keys of its own
-lagrangian:
-  init: ${algo.tail}
-"""
+WRONG_TOGETHER = {
+    # what only other algorithms or environments have
+    ("algo=sac", "preset=gpu"): "^preset=gpu: algo=sac has no 'critic_update'",
+    ("algo=paper/cpo", "preset=gpu"): "^preset=gpu: algo=cpo has no 'limits'",
+    ("algo=ppo", "lagrangian=pid"): "^this algorithm has no 'lagrangian'",
+    ("algo=sac", "critic_update.num_passes=3"): "^this algorithm has no 'critic_update'",
+    ("algo=cpo", "limits=default"): "^limits=default: 'limits' is a section",
+    ("env=SafeHopperVelocity", "algo=sac_lagrangian", "preset=privileged"): (
+        r"^preset=privileged sets env\.observe_privileged, a key that .* does not have\.$"
+    ),
+    ("env=gymnasium", "algo=cpo", "preset=gpu"): r"^preset=gpu sets env\.physics, .* not have\.$",
+    ("algo=ppo", "risk=cvar"): "^risk=cvar: algo=ppo limits no costs",
+    ("-m", "algo=cpo,sac", "risk=cvar"): "^risk=cvar: algo=sac limits no costs",
+    # how a key is written that only swept algorithms or a class of one's own have
+    ("-m", "algo=p3o,appo", "loss.kappa=5"): r"of a sweep, is added: '\+\+loss\.kappa=…'",
+    ("-m", "algo=cpo,sac", "memory.batch_size=8"): r"'\+\+memory\.batch_size=…'",
+    ("loss._target_=mine.Loss", "loss.size=3"): r"'loss.size'\. .* added: '\+\+loss.size=…'\.$",
+    # no advice that would fail
+    ("-m", "transforms=[],[saute]", "transforms.saute.kappa=2"): r"'transforms\.saute'[^+]*$",
+    ("cost_limits={cost: 5}", "limits.cost=3"): r"of a file: \+cost_limits\.cost=…$",
+}
+OF_ALL = "# @package _global_\n"
 
 
 @pytest.mark.parametrize("arguments", RIGHT, ids=" ".join)
@@ -82,42 +100,17 @@ def test_a_slate_and_a_single_environment_are_not_both_chosen():
     assert "To sweep over it, add --multirun" in status_of("slate=SG6")
 
 
-def test_a_file_that_lacks_a_general_key_is_told_so(tmp_path):
-    (tmp_path / "algo").mkdir()
-    (tmp_path / "algo" / "mine.yaml").write_text("# @package _global_\nalgo: {name: mine}\n")
-    message = status_of(f"--config-dir={tmp_path}", "algo=mine", "note=")
-    assert message == "frames is missing: the file of an algorithm sets it."
-
-
-@pytest.mark.parametrize("argument", WRONG)
-def test_wrong_words_name_the_right_ones(argument):
-    with pytest.raises(ValueError, match=WRONG[argument]) as caught:
-        composed("logger=none", argument)
-    assert len(str(caught.value).splitlines()) == 1
-    if argument == "env=gymnasium":  # where Hydra names the folder of a run
-        assert status_of(argument) == str(caught.value)
-
-
 @pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        # it once trained P3O under the name of the user's loss
-        ("defaults: [p3o]\nloss: {kappa: 1}\n", r"^algo\.loss: .* '# @package _global_'\.$"),
-        ("# @package _global_\ndefaults: [p3o, lagrangian: pi]\n", r"write /lagrangian: pi\.$"),
-    ],
+    ("words", "message"),
+    [*(((word,), WRONG[word]) for word in WRONG), *WRONG_TOGETHER.items()],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
-def test_a_file_that_would_not_change_an_algorithm_is_refused(tmp_path, text, message):
-    (tmp_path / "algo").mkdir()
-    (tmp_path / "algo" / "mine.yaml").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        composed("algo=mine", f"--config-dir={tmp_path}")
-
-
-def test_a_key_that_only_swept_algorithms_have_is_told_how_it_is_written():
-    assert "of a sweep, is added: '++loss.kappa=…'" in status_of(
-        "-m", "algo=p3o,appo", "loss.kappa=5"
-    )
-    assert "'++memory.batch_size=…'" in status_of("-m", "algo=cpo,sac", "memory.batch_size=8")
+def test_wrong_words_name_the_right_ones(words, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        composed("logger=none", *words)
+    assert len(str(caught.value).splitlines()) == 1
+    if words == ("env=gymnasium",):  # where Hydra names the folder of a run
+        assert status_of(*words) == str(caught.value)
 
 
 def test_an_algorithm_has_the_name_of_its_choice():
@@ -126,45 +119,9 @@ def test_an_algorithm_has_the_name_of_its_choice():
     assert config.algo.name == "ppo_lagrangian"
 
 
-@pytest.mark.parametrize(
-    ("algo", "argument", "words"),
-    [
-        ("sac", "preset=gpu", "^preset=gpu: algo=sac has no 'critic_update'"),
-        ("paper/cpo", "preset=gpu", "^preset=gpu: algo=cpo has no 'limits'"),
-        ("ppo", "lagrangian=pid", "^this algorithm has no 'lagrangian'"),
-        ("sac", "critic_update.num_passes=3", "^this algorithm has no 'critic_update'"),
-        ("cpo", "limits=default", "^limits=default: 'limits' is a section"),
-    ],
-)
-def test_what_only_other_algorithms_have_is_refused(algo, argument, words):
-    with pytest.raises(ValueError, match=words):
-        composed(f"algo={algo}", argument)
-
-
-@pytest.mark.parametrize(
-    ("preset", "algo", "key", "env"),
-    [
-        ("privileged", "sac_lagrangian", "observe_privileged", "SafeHopperVelocity"),
-        ("gpu", "cpo", "physics", "gymnasium"),
-    ],
-)
-def test_what_a_preset_sets_and_only_other_environments_have_is_refused(preset, algo, key, env):
-    message = rf"^preset={preset} sets env\.{key}, a key that this environment does not have\.$"
-    with pytest.raises(ValueError, match=message):
-        composed(f"env={env}", f"algo={algo}", f"preset={preset}")
-
-
 def test_an_algorithm_without_limits_takes_none_from_a_preset():
     (config,) = composed("algo=ppo", "preset=gpu")
     assert "limits" not in config
-
-
-def test_a_risk_measure_is_refused_where_no_limit_is_kept():
-    composed("algo=cpo", "risk=cvar")
-    composed("algo=ppo", "risk=chance", "transforms=[saute]")  # which is certified
-    for words in (["algo=ppo", "risk=cvar"], ["-m", "algo=cpo,sac", "risk=cvar"]):
-        with pytest.raises(ValueError, match=r"risk=cvar: algo=\w+ limits no costs"):
-            composed(*words)
 
 
 def test_a_file_that_hydra_would_not_read_is_refused(tmp_path):
@@ -194,22 +151,6 @@ def test_a_file_of_an_environment_without_its_name(tmp_path):
     assert said == "env: the file of an environment needs a line 'name: …'."
 
 
-def test_a_limit_below_limits_is_added_to_the_cost_limits():
-    with pytest.raises(ValueError, match=r"of a file: \+cost_limits\.cost=…$"):
-        composed("cost_limits={cost: 5}", "limits.cost=3")
-
-
-def test_keys_of_swept_transforms_get_no_advice_that_would_fail():
-    message = status_of("-m", "transforms=[],[saute]", "transforms.saute.kappa=2")
-    assert "no key 'transforms.saute'" in message
-    assert "++" not in message
-
-
-def test_what_a_class_of_ones_own_takes_is_told_how_it_is_written():
-    with pytest.raises(ValueError, match=r"'loss.size'\. .* is added: '\+\+loss.size=…'\.$"):
-        composed("loss._target_=mine.Loss", "loss.size=3")
-
-
 def test_an_id_with_a_namespace_names_one_folder():
     (config,) = composed("env=gymnasium", "env.id=ALE/Pong-v5")
     assert config.env.name == config.hydra.run.dir.split("/")[1] == "ALE-Pong-v5"
@@ -219,7 +160,8 @@ def test_an_id_with_a_namespace_names_one_folder():
 def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
     for group in ("algo", "env"):
         (tmp_path / group).mkdir()
-    text = "# @package _global_\ndefaults: [ppo_lagrangian, _self_]\n" + MINE
+    text = f"{OF_ALL}defaults: [ppo_lagrangian, _self_]\nalgo: {{tail: 0.25}}\n"
+    text += "lagrangian: {init: '${algo.tail}'}\n"
     (tmp_path / "algo" / "mine.yaml").write_text(text)
     (tmp_path / "env" / "Nearby.yaml").write_text("defaults: [PointGoal1]\nhazards_num: 3\n")
     folder = f"{flag}{tmp_path}{']' if '[' in flag else ''}"
@@ -244,16 +186,20 @@ def test_folders_of_ones_own_are_searched_too(tmp_path, flag):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
-        ("defaults: [ppo_lagrangien]", r"algo/mine\.yaml: there is no algo 'ppo_lagrangien'\."),
-        ("defaults: {ppo: null}", r"Invalid defaults list in 'algo/mine'"),
-        ("loss: {a: 1\nb: 2", r"mine\.yaml\", line 3"),
+        # it once trained P3O under the name of the user's loss
+        ("defaults: [p3o]\nloss: {a: 1}\n", r"^algo\.loss: .* '# @package _global_'\.$"),
+        (f"{OF_ALL}defaults: [p3o, lagrangian: pi]\n", r"write /lagrangian: pi\.$"),
+        (f"{OF_ALL}algo: {{name: mine}}\n", r"^frames is missing: the .* algorithm sets it\.$"),
+        (f"{OF_ALL}defaults: [p3p]", r"algo/mine\.yaml: there is no algo 'p3p'\."),
+        (f"{OF_ALL}defaults: {{ppo: null}}", r"Invalid defaults list in 'algo/mine'"),
+        (f"{OF_ALL}loss: {{a: 1\nb: 2\n", r"mine\.yaml\", line 3"),
     ],
 )
-def test_faults_of_files_are_told_by_the_file(tmp_path, text, words):
+def test_faults_of_files_are_told_by_the_file(tmp_path, text, message):
     (tmp_path / "algo").mkdir()
-    (tmp_path / "algo" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
-    with pytest.raises(ValueError, match=words) as caught:
+    (tmp_path / "algo" / "mine.yaml").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
         composed(f"--config-dir={tmp_path}", "algo=mine")
     assert len(str(caught.value).splitlines()) == 1

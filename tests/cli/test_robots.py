@@ -1,9 +1,8 @@
-"""Runs with a robot of one's own find it again, wherever its files are and whatever is in them."""
+"""Robots and environment files of one's own: runs find them again, whatever is in them."""
 
 import contextlib
 import json
 import shutil
-import struct
 
 import pytest
 import yaml
@@ -12,6 +11,7 @@ from run_configs import without_times
 
 import safe_rl
 from safe_rl.cli import evaluate, export
+from safe_rl.envs import SafetyGymConfig
 
 ROBOT = """
 <mujoco>
@@ -24,20 +24,16 @@ ROBOT = """
       <include file="parts/hat.xml"/>
     </body>
   </worldbody>
-  <asset><mesh name="hat" file="hat.stl"/></asset>
+  <asset><mesh name="hat" file="hat.obj"/></asset>
   <actuator><general site="imu" gear="1 0 0 0 0 0.01"/></actuator>
   <sensor><gyro name="gyro" site="imu"/></sensor>
 </mujoco>
 """
 HAT = '<mujoco><geom type="mesh" mesh="hat" pos="0 0 0.2" contype="0" conaffinity="0"/></mujoco>'
-CORNERS = ((0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1))
-
-
-def stl() -> bytes:
-    """A tetrahedron."""
-    faces = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
-    rows = [struct.pack("<12fH", 0, 0, 0, *sum((CORNERS[i] for i in f), ()), 0) for f in faces]
-    return bytes(80) + struct.pack("<I", len(rows)) + b"".join(rows)
+TETRAHEDRON = """
+v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1
+f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4
+"""
 
 
 def write_robot(folder, meshes="meshes", density=1):
@@ -47,7 +43,7 @@ def write_robot(folder, meshes="meshes", density=1):
     path.write_text(ROBOT.format(meshes=meshes, density=density))
     (folder / "robot" / "parts" / "hat.xml").write_text(HAT)
     for place in (folder / "meshes", folder / "robot" / "meshes"):
-        (place / "hat.stl").write_bytes(stl())
+        (place / "hat.obj").write_text(TETRAHEDRON)
     return path
 
 
@@ -115,8 +111,8 @@ def test_a_run_is_carried_elsewhere(run, tmp_path, monkeypatch, capsys):
 def test_another_robot_than_the_runs_is_never_taken(run, tmp_path, capsys):
     folder = run()
     note = json.loads((folder / "robot.json").read_text())
-    with (folder / "robot" / "meshes" / "hat.stl").open("ab") as file:
-        file.write(b"more")
+    with (folder / "robot" / "meshes" / "hat.obj").open("a") as file:
+        file.write("# more")
     write_robot(tmp_path, density=30)
     for kept in (note["file"], None, "../../robot/ball.xml"):
         (folder / "robot.json").write_text(json.dumps(note | {"file": kept}))
@@ -133,7 +129,7 @@ def test_what_lies_outside_of_its_folder_is_not_copied(place, run, tmp_path, cap
     meshes = place.format(tmp_path)
     folder = run(meshes=meshes)
     said = capsys.readouterr().out
-    assert f"{tmp_path}/meshes/hat.stl, which is outside its own folder" in said
+    assert f"{tmp_path}/meshes/hat.obj, which is outside its own folder" in said
     assert "The run keeps no copy of its robot" in said
     assert not (folder / "robot").exists()
     assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
@@ -145,7 +141,30 @@ def test_what_lies_outside_of_its_folder_is_not_copied(place, run, tmp_path, cap
 def test_only_what_mujoco_loads_is_copied(run, tmp_path):
     """Names were looked for in every folder of assets, where a secret of that name could lie."""
     (tmp_path / "robot" / "textures").mkdir(parents=True)
-    (tmp_path / "robot" / "textures" / "hat.stl").write_text("secret")
+    (tmp_path / "robot" / "textures" / "hat.obj").write_text("secret")
     folder = run(meshes='meshes" texturedir="textures')
     copied = {str(path.relative_to(folder)) for path in folder.glob("robot/**/*.*")}
-    assert copied == {"robot/ball.xml", "robot/meshes/hat.stl", "robot/parts/hat.xml"}
+    assert copied == {"robot/ball.xml", "robot/meshes/hat.obj", "robot/parts/hat.xml"}
+
+
+def test_a_run_keeps_every_key_of_an_environment_file_that_holds_only_what_differs(
+    tmp_path, capsys
+):
+    mine = {"name": "mine", "robot_base": "point", "num_steps": 20, "hazards_num": 2}
+    folder, file = tmp_path / "mine", tmp_path / "conf" / "env" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text(yaml.safe_dump(mine))
+    where = (f"hydra.searchpath=[file://{tmp_path / 'conf'}]", f"hydra.run.dir={folder}")
+    assert status_of("env=mine", *SMALL, *where, "frames=40") == 0
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["env"].keys() == {"name", *SafetyGymConfig().to_dict()}
+    assert config["env"]["randomize_layout"] is True
+    assert config["env"]["hazards_num"] == 2
+    assert status_of(f"resume={folder}", "frames=80") == 0
+    assert "Resuming after 40 of 80 frames." in capsys.readouterr().out
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0
+    assert "of the layouts known" not in capsys.readouterr().out
+    assert not (folder / "robot").exists()  # one of the package's needs no copy
+    # as a folder from before some keys were there
+    (folder / "config.yaml").write_text(yaml.safe_dump(config | {"env": mine}))
+    assert evaluate.main([str(folder), "episodes=2", "num_threads=1"]) == 0

@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from commands import ROOT, SMALL, composed, in_a_process
@@ -37,28 +38,19 @@ def test_jobs_at_a_time_share_the_cores(tmp_path, monkeypatch, workers, threads)
 
 def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     summary = Summary(f"{tmp_path}/jobs.jsonl")
-    outcomes = {0: 3.5, 1: ValueError("no such cost\nmore"), 2: SystemExit(130)}
-
-    def run_job(config, settings, run):
-        outcome = outcomes[int(run.directory.name.removeprefix("seed"))]
-        if isinstance(outcome, BaseException):
-            raise outcome
-        return outcome
+    outcomes = [3.5, ValueError("no such cost\nmore"), SystemExit(130), *[0.0] * 4]
 
     def carry_out(number, folder=None):
         directory = tmp_path / f"seed{number if folder is None else folder}"
-        node = {"job": {"num": number}, "mode": "MULTIRUN", "runtime": {"choices": {}}}
-        node["runtime"]["config_sources"] = []
-        node["overrides"] = {"task": []}
-        node["runtime"]["output_dir"] = str(directory)
-        config = OmegaConf.create({"hydra": node})
-        config.hydra.mode = RunMode.MULTIRUN
+        runtime = {"choices": {}, "config_sources": [], "output_dir": str(directory)}
+        node = {"job": {"num": number}, "runtime": runtime, "overrides": {"task": []}}
+        config = OmegaConf.create({"hydra": node | {"mode": RunMode.MULTIRUN}})
         summary.on_job_start(config)
         made = OmegaConf.create({"env": {"name": "mine"}, "algo": {}})
         run_in_sweep(made, config.hydra, directory)
         summary.on_job_end(config, JobReturn())
 
-    monkeypatch.setattr("safe_rl.cli.sweeps.run_job", run_job)
+    monkeypatch.setattr("safe_rl.cli.sweeps.run_job", Mock(side_effect=outcomes))
     monkeypatch.setattr("safe_rl.cli.sweeps.check_settings", lambda config: None)
     (tmp_path / "seed0").mkdir()
     (tmp_path / "seed0" / "failure.txt").write_text("of last time")
@@ -78,7 +70,6 @@ def test_a_failing_job_is_named_and_stops_nobody(tmp_path, monkeypatch, capsys):
     ]
     assert err == f"{tmp_path}/seed1: ValueError: no such cost more\n"
     assert "ValueError: no such cost\nmore" in (tmp_path / "seed1" / "failure.txt").read_text()
-    outcomes |= dict.fromkeys(outcomes, 0.0)
     for number in range(3):
         carry_out(number)
     summary.on_multirun_end(None)

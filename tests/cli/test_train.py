@@ -1,6 +1,7 @@
 """The command train.py as a whole: what Hydra is asked passes, what is wrong leaves nothing."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from commands import SMALL, in_a_process, status_of
@@ -76,9 +77,7 @@ def test_a_run_too_short_for_its_certificate_says_so(command, overrides, lines):
     assert not Path("runs/short/certificate.json").exists()
 
 
-def test_what_is_said_at_the_start_is_about_whole_batches_and_the_schedule_that_the_run_has(
-    command,
-):
+def test_what_is_said_at_the_start_is_about_the_batches_and_the_schedule_of_the_run(command):
     status, out, _ = command(*SMALL, "frames=30", "hydra.run.dir=runs/mine")
     assert not status
     assert "Training for 40 frames: whole batches of 40." in out
@@ -96,12 +95,8 @@ def test_what_is_said_at_the_start_is_about_whole_batches_and_the_schedule_that_
 def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
     status, out, _ = command(
         *(*SMALL, "frames=400", "certificate.episodes=100", "certificate.ranking=2"),
-        *(
-            "cost_limits={cost: 1.1}",
-            "env.hazards_size=5",
-            "hydra.run.dir=runs/unsafe",
-            "import=json",
-        ),
+        *("cost_limits={cost: 1.1}", "env.hazards_size=5", "import=json"),
+        "hydra.run.dir=runs/unsafe",
     )
     assert not status
     line = out.splitlines()[-1]
@@ -114,9 +109,7 @@ def test_a_run_without_a_certified_policy_says_how_to_train_on(command):
 def test_a_run_interrupted_while_it_is_certified_is_certified_when_it_is_resumed(
     command, monkeypatch
 ):
-    def interrupt(*arguments, **options):
-        raise KeyboardInterrupt
-
+    interrupt = Mock(side_effect=KeyboardInterrupt)
     with monkeypatch.context() as patch:
         patch.setattr("safe_rl.evaluation.certifying.certify", interrupt)
         status, out, _ = command(
@@ -142,38 +135,29 @@ def test_a_backend_that_matplotlib_does_not_know_leaves_a_run_without_a_picture(
     assert "Traceback" not in said
 
 
+SAC = ("algo=sac", *SMALL[:-1], "memory.capacity=20_000")
+OUT_OF_MEMORY = RuntimeError("alloc_cpu.cpp:127] can't allocate memory:\nyou")
+
+
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("settings", "error", "words"),
     [
-        (ConfigError("the cost is not finite"), "the cost is not finite"),
-        (FloatingPointError("the cost is not finite"), "the cost is not finite"),
-        (MemoryError(), "not enough memory with frames_per_batch=40, num_envs=2"),
-        (RuntimeError("alloc_cpu.cpp:127] can't allocate memory:\nyou"), "not enough memory with"),
+        (SMALL, ConfigError("the cost is not finite"), "the cost is not finite"),
+        (SMALL, FloatingPointError("the cost is not finite"), "the cost is not finite"),
+        (SMALL, MemoryError(), "not enough memory with frames_per_batch=40, num_envs=2"),
+        (SMALL, OUT_OF_MEMORY, "not enough memory with"),
+        (SAC, MemoryError(), "with memory.capacity=20000, frames_per_batch=40, num_envs=2 and"),
     ],
 )
-def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(command, monkeypatch, error, words):
-    def fail(trainer, batches):
-        raise error
-
-    monkeypatch.setattr(Trainer, "epoch", fail)
-    (line,) = command(*SMALL, "frames=40")[0].splitlines()
+def test_what_is_wrong_while_it_trains_ends_the_run_in_a_line(
+    command, monkeypatch, settings, error, words
+):
+    monkeypatch.setattr(Trainer, "epoch", Mock(side_effect=error))
+    (line,) = command(*settings, "frames=40")[0].splitlines()
     assert words in line
 
 
-def test_a_replay_buffer_that_does_not_fit_is_named(command, monkeypatch):
-    def fail(trainer, batches):
-        raise MemoryError
-
-    monkeypatch.setattr(Trainer, "epoch", fail)
-    few = ("num_envs=2", "frames_per_batch=40", "frames=40", "memory.capacity=20_000")
-    (line,) = command("algo=sac", *few, "num_threads=1", "logger=none")[0].splitlines()
-    assert "memory with memory.capacity=20000, frames_per_batch=40, num_envs=2 and" in line
-
-
 def test_an_error_that_no_setting_explains_keeps_its_traceback(command, monkeypatch):
-    def fail(trainer, batches):
-        raise ValueError("shapes differ")
-
-    monkeypatch.setattr(Trainer, "epoch", fail)
+    monkeypatch.setattr(Trainer, "epoch", Mock(side_effect=ValueError("shapes differ")))
     with pytest.raises(ValueError, match="shapes differ"):
         command(*SMALL, "frames=40")
