@@ -1,10 +1,10 @@
 """The evaluate command on a tiny trained run: what it runs, writes and refuses."""
 
-import csv
 import json
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 import yaml
 from evaluated_runs import NUM_STEPS, options
@@ -17,16 +17,10 @@ from safe_rl.runs.folder import is_unfinished
 from safe_rl.runs.run import Run
 
 
-def read_columns(path):
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-
-
 def test_the_summary_is_that_of_the_episodes(run):
     result = evaluate(run, options(cvar_alpha=0.5))
     assert [path.name for path in result.files] == ["evaluation.json", "evaluation.csv"]
-    episodes = read_columns(run / "evaluation.csv")
+    episodes = pandas.read_csv(run / "evaluation.csv")
     assert set(episodes) == {"return", "length", "cost", "cost_hazards", "cost_exception"}
     np.testing.assert_array_equal(episodes["length"], NUM_STEPS)
     assert len(episodes["cost"]) == 7
@@ -46,7 +40,7 @@ def test_the_summary_is_that_of_the_episodes(run):
 def test_the_seed_decides_and_the_mean_action_is_not_sampled(run):
     def returns(**changes):
         evaluate(run, options(**changes))
-        return read_columns(run / "evaluation.csv")["return"].tolist()
+        return pandas.read_csv(run / "evaluation.csv")["return"].tolist()
 
     sampled = returns(seed=5)
     assert returns(seed=5) == sampled
@@ -56,8 +50,7 @@ def test_the_seed_decides_and_the_mean_action_is_not_sampled(run):
 
 def test_layouts_can_be_those_of_training_or_others(run):
     trained_on = {"env": {"layout_seeds": 10, "layout_seeds_first": 0}}
-    config = OmegaConf.merge(OmegaConf.load(run / "config.yaml"), trained_on)
-    OmegaConf.save(config, run / "config.yaml")
+    OmegaConf.save(OmegaConf.merge(Run(run).config, trained_on), run / "config.yaml")
 
     def known(**env):
         return evaluate(run, options(episodes=1, env=env)).facts["layouts_trained_on"]

@@ -1,6 +1,7 @@
 """What an evaluation refuses: wrong options, other observations, broken checkpoints."""
 
 import shutil
+from unittest.mock import Mock
 
 import pytest
 from evaluated_runs import skip_without_opengl
@@ -10,6 +11,19 @@ from safe_rl.cli.evaluate import main
 from safe_rl.cli.report import main as report_main
 from safe_rl.envs import ContractError
 from safe_rl.evaluation.loading import override_env
+
+
+@pytest.fixture
+def refused(run, capsys):
+    """Evaluates the run, which is refused; returns the line that says why."""
+
+    def refused(*arguments):
+        assert main([str(run), *arguments]) == 1
+        error = capsys.readouterr().err.splitlines()[-1]
+        assert error.startswith("error: ")
+        return error
+
+    return refused
 
 
 @pytest.mark.parametrize(
@@ -22,27 +36,22 @@ from safe_rl.evaluation.loading import override_env
         (["picture=there.png"], "ending in .gif or .webp"),
     ],
 )
-def test_what_cannot_be_done_ends_in_one_line(run, arguments, message, capsys, monkeypatch):
+def test_what_cannot_be_done_ends_in_one_line(run, refused, arguments, message, monkeypatch):
     if "video=true" in arguments:
         skip_without_opengl()
         # before any episode
         monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
     (run / "evaluation.transitions").mkdir()
-    (run / "evaluation.transitions" / "00000000.pt").touch()
-    assert main([str(run), *arguments]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ")
-    assert message in error
-    assert (run / "evaluation.transitions" / "00000000.pt").exists()
+    (recorded := run / "evaluation.transitions" / "00000000.pt").touch()
+    assert message in refused(*arguments)
+    assert recorded.exists()
 
 
-def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
-    mine = tmp_path / "mine"
-    mine.mkdir()
+def test_nothing_is_recorded_through_a_link(run, refused, tmp_path):
+    (mine := tmp_path / "mine").mkdir()
     (mine / "00000003.pt").touch()
     (run / "evaluation.transitions").symlink_to(mine)
-    assert main([str(run), "record=true", "episodes=1"]) == 1
-    assert "evaluation.transitions is a link" in capsys.readouterr().err
+    assert "evaluation.transitions is a link" in refused("record=true", "episodes=1")
     assert (mine / "00000003.pt").exists()
 
 
@@ -50,22 +59,19 @@ def test_nothing_is_recorded_through_a_link(run, tmp_path, capsys):
     ("arguments", "place"), [([], "evaluation.json"), (["picture=there.gif"], "../there.gif")]
 )
 def test_what_cannot_be_written_is_said_before_any_episode(
-    arguments, place, run, capsys, monkeypatch
+    arguments, place, run, refused, monkeypatch
 ):
     monkeypatch.chdir(run.parent)
     monkeypatch.setattr("safe_rl.evaluation.measuring.collect_episodes", None)
     (run / place).mkdir()
-    assert main([str(run), *arguments]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ")
-    assert f"{place.removeprefix('../')} is a folder, where a file is to be written." in error
+    words = f"{place.removeprefix('../')} is a folder, where a file is to be written."
+    assert words in refused(*arguments)
 
 
-def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, capsys, monkeypatch):
+def test_a_run_that_others_may_only_read_is_evaluated_as_a_copy(run, refused, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, mode: False)  # root may write anywhere
-    assert main([str(run)]) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert f"{run} is read-only. A run's evaluations lie in its folder: evaluate a copy" in error
+    words = f"{run} is read-only. A run's evaluations lie in its folder: evaluate a copy"
+    assert words in refused()
 
 
 @pytest.mark.parametrize(("command", "what"), [(main, "RUN_DIR"), (report_main, "RUNS_DIR")])
@@ -74,36 +80,30 @@ def test_a_command_without_a_folder_asks_for_it(command, what, capsys):
     assert f" {what} [option=value ...]" in capsys.readouterr().out
 
 
-def test_an_environment_that_breaks_its_contract_ends_in_one_line(run, capsys, monkeypatch):
+def test_an_environment_that_breaks_its_contract_ends_in_one_line(refused, monkeypatch):
     """A family of one's own that makes 20 environments, say, however many it is asked for."""
-
-    def make(*node, **options):
-        raise ContractError("mine was asked for 25 environments and made 20")
-
-    monkeypatch.setattr("safe_rl.evaluation.loading.make_env", make)
-    assert main([str(run)]) == 1
-    assert "error: mine was asked for 25" in capsys.readouterr().err
+    error = ContractError("mine was asked for 25 environments and made 20")
+    monkeypatch.setattr("safe_rl.evaluation.loading.make_env", Mock(side_effect=error))
+    assert refused().startswith("error: mine was asked for 25")
 
 
-def test_without_a_best_checkpoint_the_last_is_offered(run, capsys):
+def test_without_a_best_checkpoint_the_last_is_offered(run, refused):
     shutil.rmtree(run / "checkpoints" / "best")
-    assert main([str(run), "checkpoint=best"]) == 1
-    error = capsys.readouterr().err
+    error = refused("checkpoint=best")
     assert "in no epoch did episodes end that kept every cost limit, with estimate_<cost>" in error
     assert "≤ target_<cost>. Use checkpoint=last" in error
 
 
-def test_the_policy_of_another_run_is_not_evaluated_as_the_runs_own(run, capsys):
+def test_the_policy_of_another_run_is_not_evaluated_as_the_runs_own(run, refused):
     """Its figures would lie in the run's folder, and stand in its row of a report."""
-    other = run.parent / "other"
-    shutil.copytree(run, other)
+    other = shutil.copytree(run, run.parent / "other")
     theirs = max((other / "checkpoints" / "last").iterdir())
     assert main([str(run), "episodes=1", f"checkpoint={theirs}"]) == 0  # of a copy
     config = OmegaConf.load(other / "config.yaml")
     config.seed += 1
     OmegaConf.save(config, other / "config.yaml")
-    assert main([str(run), "episodes=1", f"checkpoint={theirs}"]) == 1
-    assert f"is a checkpoint of another run, {other}: name that run." in capsys.readouterr().err
+    error = refused("episodes=1", f"checkpoint={theirs}")
+    assert f"is a checkpoint of another run, {other}: name that run." in error
 
 
 def test_of_mappings_only_what_is_named_changes():
@@ -116,12 +116,11 @@ def test_of_mappings_only_what_is_named_changes():
     assert override_env(config, {"cost": {"limit": 2.0}})["cost"] == {**cost, "limit": 2.0}
 
 
-def test_keys_that_an_environment_of_ones_own_does_not_have_are_refused(run, capsys):
+def test_keys_that_an_environment_of_ones_own_does_not_have_are_refused(run, refused):
     """It would leave them alone, and what was not changed would be measured as if it were."""
     config = OmegaConf.load(run / "config.yaml")
     config.env = {"_target_": "users.make", "name": "mine", "edge": 1.0}
     OmegaConf.save(config, run / "config.yaml")
-    assert main([str(run), "env.edgy=0.5"]) == 1
-    error = capsys.readouterr().err
-    assert "users.make has no such key. Did you mean 'edge'? The run has edge." in error
+    words = "users.make has no such key. Did you mean 'edge'? The run has edge."
+    assert words in refused("env.edgy=0.5")
     assert override_env(config, {"edge": 0.5})["edge"] == 0.5

@@ -61,7 +61,6 @@ def test_a_policy_of_the_package_is_loaded_and_evaluated_as_a_run(run, package, 
 
 
 def test_a_packed_policy_is_small_and_says_where_it_is_from(run, tmp_path):
-    (run / ".hydra").mkdir()
     (run / ".hydra/overrides.yaml").write_text(
         "- model.hidden_sizes=[16, 16]\n- '+note=it''s'\n- import=['my_gym.py']\n"
     )
@@ -133,6 +132,12 @@ def exported(run, file, *options):
     return runtime.InferenceSession(file)
 
 
+def texts_of(session):
+    """What an exported policy says of itself."""
+    found = session.get_modelmeta().custom_metadata_map
+    return {name: json.loads(text) for name, text in found.items()}
+
+
 def test_an_exported_policy_is_the_policy(run, tmp_path):
     session = exported(run, tmp_path / "policy.onnx", "checkpoint=last")
     loaded = safe_rl.load(run)
@@ -202,13 +207,11 @@ def test_an_exported_policy_says_which_transforms_its_program_needs(tmp_path, ca
     certified(run.directory, True)
     session = exported(run.directory, tmp_path / "policy.onnx")
     assert "without the transforms observed_costs:" in capsys.readouterr().out
-    texts = session.get_modelmeta().custom_metadata_map
-    certificate = json.loads(texts["certificate"])
-    assert certificate["transforms"] == ["observed_costs"]
-    assert "deterministic" not in certificate  # which older ones lack: `actions` says it
+    texts = texts_of(session)
+    assert texts["certificate"]["transforms"] == ["observed_costs"]
+    assert "deterministic" not in texts["certificate"]  # which older ones lack: `actions` says it
     # the names of the costs that a program has to observe, in their order
-    steps, names = run.env.rollout(20)["next"], json.loads(texts["costs"])
-    columns = json.loads(texts["observation"])
+    steps, names, columns = run.env.rollout(20)["next"], texts["costs"], texts["observation"]
     seen = [columns.index(f"last_costs[{number}]") for number in range(len(names))]
     expected = torch.cat([steps[name] for name in names], -1)
     assert torch.equal(steps["observation"][..., seen], expected)
@@ -228,19 +231,17 @@ def test_what_is_certified_is_what_is_exported(run, tmp_path, capsys, determinis
     file = tmp_path / "new" / "folder" / "policy.onnx"
     zeros = {"observation": np.zeros((2, 60), np.float32)}
     session = exported(run, file)
-    texts = session.get_modelmeta().custom_metadata_map
-    kinds = {True: "mean", False: "sampled"}
-    assert json.loads(texts["actions"]) == kinds[deterministic]
-    assert json.loads(texts["certificate"])["level"] == 0.95
+    texts, kinds = texts_of(session), {True: "mean", False: "sampled"}
+    assert texts["actions"] == kinds[deterministic]
+    assert texts["certificate"]["level"] == 0.95
     # the rows see the same: they act alike unless actions are sampled
     (actions,) = session.run(["action"], zeros)
     assert np.array_equal(*actions) == deterministic
     assert "WARNING" not in capsys.readouterr().err
     other = exported(run, file, f"actions={kinds[not deterministic]}")
     assert "which the certificate does not cover" in capsys.readouterr().err
-    texts = other.get_modelmeta().custom_metadata_map
-    assert json.loads(texts["actions"]) == kinds[not deterministic]
-    assert json.loads(texts["certificate"]) is None
+    texts = texts_of(other)
+    assert (texts["actions"], texts["certificate"]) == (kinds[not deterministic], None)
 
 
 def test_the_samples_of_a_plain_actor_are_exported_too(run, tmp_path, monkeypatch):

@@ -199,15 +199,10 @@ def make_evaluation(make, device="cpu", **keys):
 
 @pytest.mark.parametrize(("fixed", "seeds"), [(True, [7, 7]), (False, [107, 207])])
 def test_evaluations_in_between_keep_to_a_fixed_layout(fixed, seeds):
-    met = []
-
-    def make(*, num_envs, seed):
-        met.append(seed)
-        return KnownLengths([[2, 2]] * num_envs)
-
+    make = Mock(side_effect=lambda *, num_envs, seed: KnownLengths([[2, 2]] * num_envs))
     evaluate = make_evaluation(make, fixed_layout=fixed)
     assert [evaluate(after - 100, after)["evaluation_cost"] for after in (100, 200)] == [1.0, 1.0]
-    assert met == seeds
+    assert [call.kwargs["seed"] for call in make.call_args_list] == seeds
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
