@@ -24,16 +24,14 @@ def make_env(node, *, num_envs, device, seed, num_threads):
     return PricedPointMass(num_envs, 20, seed % 1000)
 
 
-def test_every_batch_of_a_test_has_new_instances_of_the_environment(monkeypatch):
+def test_every_batch_of_a_test_has_new_instances_of_the_environment():
     """An instance draws at construction what its episodes cost: they are not independent."""
 
     class Drawn(PricedPointMass):
         def __init__(self, *arguments):
             super().__init__(*arguments)
-            draws = torch.rand(
-                *self.batch_size, 1, generator=torch.Generator().manual_seed(arguments[2])
-            )
-            self.drawn = (draws < 0.1).float()
+            generator = torch.Generator().manual_seed(arguments[2])
+            self.drawn = (torch.rand(*self.batch_size, 1, generator=generator) < 0.1).float()
 
         def _step(self, tensordict):
             return super()._step(tensordict).set("cost", self.drawn)

@@ -5,6 +5,7 @@ import re
 import shutil
 from dataclasses import replace
 from functools import cache
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -25,6 +26,19 @@ OPTIONS = CertificateOptions(ranking=6, episodes=120, tests=2, level=0.95, most_
 
 def make_env(node, *, num_envs, device, seed, num_threads):
     return PricedPointMass(num_envs, 20, seed % 1000)
+
+
+def change(directory, before, after):
+    """Replace words of a run's configuration."""
+    path = directory / "config.yaml"
+    path.write_text(path.read_text().replace(before, after))
+
+
+def certify_noting_seeds(directory, options=OPTIONS):
+    """The certificate, and the seeds of the environments whose episodes it is made of."""
+    make = Mock(wraps=make_env)
+    certificate = certify(directory, options, make_env=make)
+    return certificate, {call.kwargs["seed"] for call in make.call_args_list}
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +88,6 @@ def test_a_certificate_is_about_the_policy_beside_it_whenever_it_is_interrupted(
     first = certify(directory, OPTIONS, make_env=make_env).checkpoint
     other = next(path for path in run.checkpoints("last") if path.name != first.name)
 
-    def kill(*arguments):
-        raise KeyboardInterrupt
-
     def certify_other():
         certificate = Certificate(other, 1.0, Verdict(0, [0], {}, {}, [], {}, 9), OPTIONS)
         certifying._keep(run, other)
@@ -85,7 +96,7 @@ def test_a_certificate_is_about_the_policy_beside_it_whenever_it_is_interrupted(
 
     for step in ("_write", "_remove_earlier"):
         with monkeypatch.context() as patch:
-            patch.setattr(certifying, step, kill)
+            patch.setattr(certifying, step, Mock(side_effect=KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):
                 certify_other()
         name = run.certificate["checkpoint"]
@@ -127,8 +138,7 @@ def test_a_test_that_cannot_succeed_is_not_made_and_changes_nothing(train, limit
     directory = train("{cost: 19}")
     assert certify(directory, OPTIONS, make_env=make_env).checkpoint is not None
     if limit == "0":
-        config = directory / "config.yaml"
-        config.write_text(config.read_text().replace("cost: 19", "cost: 0"))
+        change(directory, "cost: 19", "cost: 0")
     files = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
     refused = certify(directory, replace(OPTIONS, episodes=2), make_env=make_env)
     assert str(refused).startswith(f"Not tested at 95% with sampled actions: {why}")
@@ -196,8 +206,7 @@ def test_a_certified_policy_is_replaced_whole_or_taken_back(train, monkeypatch):
     assert third.test == 3  # as of other checkpoints
     assert after.name != before.name
     assert list(after.parent.iterdir()) == [after]
-    config = directory / "config.yaml"
-    config.write_text(config.read_text().replace("cost: 19", "cost: 2"))
+    change(directory, "cost: 19", "cost: 2")
     assert certify(directory, OPTIONS, make_env=make_env).checkpoint is None
     assert not json.loads((directory / "certificate.json").read_text())["certified"]
     with pytest.raises(FileNotFoundError):
@@ -210,8 +219,7 @@ def test_an_exported_policy_is_certified_anew_and_keeps_its_weights(train, tmp_p
     weights = pack_policy(run, folder)
     mean = certify(folder, replace(OPTIONS, deterministic=True), make_env=make_env)
     assert mean.checkpoint == weights
-    config = folder / "config.yaml"
-    config.write_text(config.read_text().replace("cost: 19", "cost: 2"))
+    change(folder, "cost: 19", "cost: 2")
     assert certify(folder, OPTIONS, make_env=make_env).checkpoint is None
     assert Run(folder).find_checkpoint("last").name == weights.name
     with pytest.raises(FileNotFoundError):
@@ -221,39 +229,26 @@ def test_an_exported_policy_is_certified_anew_and_keeps_its_weights(train, tmp_p
 def test_one_candidate_has_the_error_of_a_test_alone_and_episodes_that_have_not_chosen_it(
     train, tmp_path
 ):
-    run, tested = train("{cost: 19}"), {}
-
-    def make(node, *, seed, **keys):
-        tested[place].add(seed)
-        return make_env(node, seed=seed, **keys)
-
-    fewest = []
+    run, fewest, seeds = train("{cost: 19}"), [], {}
     for place, tests in (("run", 1), ("alone", 1), ("of three", 3), ("run again", 2)):
-        tested[place] = set()
         folder = run if place.startswith("run") else pack_policy(run, tmp_path / place).parents[2]
-        options = replace(OPTIONS, tests=tests)
-        fewest.append(certify(folder, options, make_env=make).fewest)
+        certificate, met = certify_noting_seeds(folder, replace(OPTIONS, tests=tests))
+        fewest.append(certificate.fewest)
+        seeds[place] = {seed for seed in met if seed > _TEST}
     assert fewest[0] == fewest[1] == fewest[2]
-    seeds = {place: {seed for seed in found if seed > _TEST} for place, found in tested.items()}
     assert seeds["alone"] == seeds["of three"]
     assert not seeds["run"] & seeds["alone"]
     assert not seeds["run"] & seeds["run again"]
 
 
 def test_a_device_that_this_machine_lacks_is_replaced(train, monkeypatch):
-    directory, met = train("{cost: 19}"), []
-    config = directory / "config.yaml"
-    config.write_text(config.read_text().replace("device: cpu", "device: cuda:1"))
+    directory, make = train("{cost: 19}"), Mock(side_effect=KeyboardInterrupt)
+    change(directory, "device: cpu", "device: cuda:1")
     for name, value in (("is_available", True), ("device_count", 1)):
         monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
-
-    def make(node, *, device, **keys):
-        met.append(device)
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
         certify(directory, OPTIONS, make_env=make)
-    assert met == ["cuda"]
+    assert make.call_args.kwargs["device"] == "cuda"
 
 
 def test_without_limits_there_is_nothing_to_certify(train):
@@ -262,39 +257,20 @@ def test_without_limits_there_is_nothing_to_certify(train):
 
 
 def test_a_fixed_layout_is_certified_as_it_was_learned(train):
-    met = []
-
-    def make(node, *, seed, **keys):
-        met.append(seed)
-        return make_env(node, seed=seed, **keys)
-
     directory = train("{cost: 19}", "+env.randomize_layout=false", "seed=3")
-    certify(directory, OPTIONS, make_env=make)
-    assert set(met) == {3}
+    assert certify_noting_seeds(directory)[1] == {3}
     # where layouts are drawn, neither training's nor the ranking's are tested
-    met.clear()
-    directory.joinpath("config.yaml").write_text(
-        directory.joinpath("config.yaml").read_text().replace("randomize_layout: false", "")
-    )
-    certify(directory, OPTIONS, make_env=make)
-    assert len(set(met)) > 2
-    assert 3 not in met
+    change(directory, "randomize_layout: false", "")
+    _, seeds = certify_noting_seeds(directory)
+    assert len(seeds) > 2
+    assert 3 not in seeds
 
 
 def test_tests_of_a_seed_are_on_other_layouts_than_the_ranking_of_the_next(train):
-    met = {}
-
-    def make(node, *, seed, **keys):
-        met[current].append(seed)
-        return make_env(node, seed=seed, **keys)
-
-    directory = train("{cost: 19}", "seed=0")
-    config = (directory / "config.yaml").read_text()
-    for current in range(3):
-        met[current] = []
-        (directory / "config.yaml").write_text(config.replace("seed: 0", f"seed: {current}"))
-        certify(directory, OPTIONS, make_env=make)
-    different = [set(seeds) for seeds in met.values()]
+    directory, different = train("{cost: 19}", "seed=0"), []
+    for seed in range(3):
+        change(directory, f"seed: {seed - 1}", f"seed: {seed}")
+        different.append(certify_noting_seeds(directory)[1])
     assert len(set.union(*different)) == sum(map(len, different))
 
 
