@@ -1,25 +1,41 @@
-"""What the pages on all algorithms say: snippets run, columns and defaults are the program's."""
+"""The pages of algorithms: their parts; columns and defaults are the program's."""
 
 import re
 
 import marks
 import pytest
-from made import ALGORITHMS, DOCS, columns_of
+from commands import ROOT
 from omegaconf import OmegaConf
 from point_mass import PointMass
-from run_configs import compose_config, point_mass_config
+from run_configs import CONF, compose_config, off_policy_config, point_mass_config
 
 from safe_rl.collectors import Recording
 from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer
 
+DOCS = ROOT / "docs"
 PAGE = (DOCS / "algorithms" / "index.md").read_text()
 # the table of every algorithm, and those of groups of columns
 OF_ALL, _, OF_GROUPS = (
     (DOCS / "algorithms" / "columns.md").read_text().partition("## Costs and limits")
 )
-LIMITED = ["cost_hazards", "cost_north"]
-OFF_POLICY = [algo for algo in ALGORITHMS if "memory" in columns_of(algo)]
+ALGORITHMS = sorted(path.stem for path in (CONF / "algo").glob("*.yaml"))
+
+
+def page_of(algo):
+    return (DOCS / "algorithms" / f"{algo}.md").read_text()
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_a_page_has_its_parts_in_order(algo):
+    page = page_of(algo)
+    heads = ("## Options", "## Measured", "## When to choose it", "## What is logged")
+    places = [page.find(f"\n{words}") for words in ("$$", *heads)]
+    assert places == sorted(places)
+    assert places[0] > 0
+    assert f'--8<-- "conf/algo/{algo}.yaml"' in page
+    made = dict(re.findall(r"<!-- made: (measured|single) (.*?) -->", page))
+    assert made.get("measured") == algo or "single" in made or "o results yet" in page
 
 
 def test_every_algorithm_is_in_the_lists():
@@ -39,47 +55,40 @@ def names_in(first_cells, costs):
     return {entry.replace("<cost>", cost) for entry in found for cost in costs}
 
 
-def columns_of_groups(algo, costs):
-    """Names of the columns of the groups that an algorithm's page names."""
+def groups_of(algo):
+    """Groups of the columns that an algorithm logs, as its page says."""
+    (line,) = re.findall(r"^Groups of \[columns\].*: (.*)\.$", page_of(algo), re.M)
+    return set(re.findall(r"`(\w+)`", line))
+
+
+def columns_of_groups(groups, costs):
+    """Names of the columns of these groups."""
     rows = [row for row in cells(OF_GROUPS) if len(row) == 3]
-    groups = set(columns_of(algo))
     assert groups <= {name for *_, names in rows for name in names.split(", ")}
     named = [first for first, _, names in rows if groups & {*names.split(", ")}]
     return names_in(named, costs)
 
 
-def columns_of_a_run(config, folder):
-    build_trainer(config, PointMass(config.num_envs), folder).run()
-    return set(read_table(folder / "progress.csv"))
-
-
-@pytest.mark.parametrize("algo", [algo for algo in ALGORITHMS if algo not in OFF_POLICY])
+@pytest.mark.parametrize("algo", ALGORITHMS)
 def test_the_columns_are_those_of_a_run(algo, tmp_path):
-    config = point_mass_config(
-        f"algo={algo}",
-        "frames=160",
-        "cost_limits={cost_hazards: 1, cost_north: 1}",
-        minibatch_size=None if "trpo" in columns_of(algo) else 40,
-    )
+    groups, limited, env = groups_of(algo), ["cost_hazards", "cost_north"], PointMass(4)
     documented = names_in(next(zip(*cells(OF_ALL), strict=True)), PointMass.cost_keys)
-    documented |= columns_of_groups(algo, LIMITED)
-    assert columns_of_a_run(config, tmp_path) == documented
-
-
-@pytest.mark.parametrize("algo", OFF_POLICY)
-def test_the_columns_are_those_of_an_off_policy_run(algo, tmp_path):
-    sizes = ["frames=160", "num_envs=4", "frames_per_batch=80", "memory.batch_size=8"]
-    keys = [f"algo={algo}", "env=PointMass", "logger=none", "policy_update.updates_per_step=0.05"]
-    if algo == "bc":
-        env = PointMass(4)
-        Recording(tmp_path / "data", env.cost_keys).write(0, env.rollout(20))
-        keys += [f"dataset.path={tmp_path / 'data'}"]
-    config = compose_config(*keys, "exploration.random_steps=80", *sizes)
-    documented = names_in(next(zip(*cells(OF_ALL), strict=True)), PointMass.cost_keys)
-    # those of its table that begin so are of PPO
-    documented = {name for name in documented if not name.startswith(("policy_", "critic_"))}
-    documented |= columns_of_groups(algo, ["cost"])
-    assert columns_of_a_run(config, tmp_path) == documented
+    keys = [f"algo={algo}", "frames=160"]
+    if "memory" in groups:
+        limited = ["cost"]
+        # those of its table that begin so are of PPO
+        documented = {n for n in documented if not n.startswith(("policy_", "critic_"))}
+        if algo == "bc":
+            Recording(tmp_path / "data", env.cost_keys).write(0, env.rollout(20))
+            keys += [f"dataset.path={tmp_path / 'data'}"]
+        keys += ["frames_per_batch=80", "exploration.random_steps=80", "memory.batch_size=8"]
+        config = off_policy_config(*keys)
+    else:
+        sizes = {"minibatch_size": None if "trpo" in groups else 40}
+        config = point_mass_config(*keys, "cost_limits={cost_hazards: 1, cost_north: 1}", **sizes)
+    build_trainer(config, env, tmp_path / "run").run()
+    found = set(read_table(tmp_path / "run" / "progress.csv"))
+    assert found == documented | columns_of_groups(groups, limited)
 
 
 @pytest.mark.parametrize("folder", ["", "paper/"])

@@ -37,9 +37,8 @@ def test_what_is_said_of_the_limit(held_out):
     assert f"{kept} of the {total} constrained runs" in readme
     assert f"over the whole training {total - over} of them are above it" in readme
     certified = int(results.certified(held_out).split()[0])
-    assert (
-        f"{end} runs are within the limit over the last half million steps, and {certified}" in page
-    )
+    words = f"{end} runs are within the limit over the last half million steps, and {certified}"
+    assert words in page
     highest = re.search(r"to ([\d.]+) \(", results.new_episodes(held_out))[1]
     assert f"a mean cost of at most {highest}" in readme
 
@@ -52,11 +51,8 @@ def test_what_the_pages_of_algorithms_say_of_certificates(held_out):
 
 def test_what_is_said_of_hard_tasks():
     held = results.runs("held_actions").query("seed not in (110, 111)")
-    assert {results.certified(group).split(",")[0] for _, group in held.groupby("environment")} == {
-        "4 of 4",
-        "3 of 3",
-        "1 of 1",
-    }
+    found = {results.certified(group).split(",")[0] for _, group in held.groupby("environment")}
+    assert found == {"4 of 4", "3 of 3", "1 of 1"}
     for env in ("PointGoal2", "PointButton1", "PointPush1"):
         returns = results.certified(held.query("environment == @env")).partition("at ")[2]
         assert f"{returns} on {env}" in said("README.md")
@@ -81,14 +77,10 @@ def test_how_many_episodes_exceed_the_limit_under_certified_policies(held_out):
 
 
 def test_how_far_off_the_cost_critics_are():
-    costs, told = [], []
-    for run in (
-        results.runs("held_out")
-        .query("environment == 'PointGoal1' and algorithm == 'sac_lagrangian'")
-        .run
-    ):
-        told.append(np.mean(run.table["policy_cost_qvalue"][-100:]) * 1000 * (1 - 0.99))
-        costs.append(results.figures(run, 5e5)["cost"])
+    chosen = "environment == 'PointGoal1' and algorithm == 'sac_lagrangian'"
+    runs = results.runs("held_out").query(chosen).run
+    told = [np.mean(run.table["policy_cost_qvalue"][-100:]) * 1000 * (1 - 0.99) for run in runs]
+    costs = [results.figures(run, 5e5)["cost"] for run in runs]
     words = f"{min(told):.0f} to {max(told):.0f} on PointGoal1, where episodes cost"
     assert f"{words} {min(costs):.0f} to {max(costs):.0f}." in said("docs/off_policy.md")
 

@@ -1,12 +1,13 @@
 """Videos, animated pictures and recordings of evaluated episodes."""
 
-import csv
+from unittest.mock import Mock
 
 import numpy as np
+import pandas
 import pytest
 import torch
 from evaluated_runs import NUM_STEPS, options, skip_without_opengl
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from safe_rl.collectors import read_recording
 from safe_rl.envs import from_gymnasium, make_env
@@ -65,11 +66,10 @@ def test_what_an_evaluation_records_is_what_it_measured(run):
     steps = read_recording(result.files[-1])
     assert steps.shape == (3, 3 * NUM_STEPS)
     returns = steps["next", "reward"].double().reshape(3, 3, NUM_STEPS).sum(-1)
-    with result.files[1].open() as table:
-        found = [float(row["return"]) for row in csv.DictReader(table)]
+    found = pandas.read_csv(result.files[1])["return"]
     # three of the first world, two of the others
     expected = [*returns[0].tolist(), *returns[1:, :2].flatten().tolist()]
-    assert found == pytest.approx(expected, abs=1e-5)
+    assert found.tolist() == pytest.approx(expected, abs=1e-5)
     evaluate(run, options(episodes=1, num_envs=1, record=True, name="kept"))
     assert read_recording(result.files[-1]).shape == (1, NUM_STEPS)
 
@@ -79,50 +79,39 @@ def test_an_animated_picture_shows_the_same_episode(run, tmp_path, suffix):
     skip_without_opengl()
     film, path = FORMATS[suffix], tmp_path / f"episode.{suffix}"
     (tmp_path / "python").symlink_to(run)  # outside of the run's folder links may lie beside it
-    found = [
+    other, result = (
         evaluate(run, options(episodes=2, picture=str(path), **extra))
         for extra in ({}, {"camera": "fixedfar"})
-    ]
-    assert found[0].files[-1] == path
+    )
+    assert result.files[-1] == path
     with Image.open(path) as picture:
         assert picture.info["loop"] == 0
         assert picture.n_frames == -(-NUM_STEPS // film.steps_per_frame) + 1
-        frames = []
-        for frame in range(picture.n_frames):
-            picture.seek(frame)
-            picture.load()
-            frames.append(np.asarray(picture.convert("RGB"), dtype=float))
-    assert {frame.shape[1] for frame in frames} == {film.width}
-    caption = np.stack(frames)[:, film.height + 4 :]
+        shown = ImageSequence.Iterator(picture)
+        frames = np.stack([np.asarray(frame.convert("RGB"), dtype=float) for frame in shown])
+    assert frames.shape[2] == film.width
+    caption = frames[:, film.height + 4 :]
     assert np.median(caption) > 240
     assert caption.min() < 110
     # something moves, and what stands still is the same in all frames
     moved = np.abs(frames[0] - frames[-1])[: film.height].max(-1) > 40
     assert 0.0 < moved.mean() < 0.5
-    assert [e.estimates["episode_return"] for e in found] == [
-        found[0].estimates["episode_return"]
-    ] * 2
+    assert result.estimates["episode_return"] == other.estimates["episode_return"]
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_of_one_world_it_is_the_first_episode_to_its_end(run, deterministic, tmp_path, monkeypatch):
     skip_without_opengl()
-    shown, draw = [], video._frame
-
-    def note(picture, *counts):
-        shown.append(counts)
-        return draw(picture, *counts)
+    draw = Mock(wraps=video._frame)
 
     def drawing(*given, **keys):  # as environments of one's own may, from torch's generator
         torch.rand(3)
         return make_env(*given, **keys)
 
-    monkeypatch.setattr(video, "_frame", note)
+    monkeypatch.setattr(video, "_frame", draw)
     monkeypatch.setattr(measuring, "maker_of", lambda run: drawing)
     picture = str(tmp_path / "episode.webp")
     changes = {"num_envs": 1, "deterministic": deterministic}
     result = evaluate(run, options(episodes=2, picture=picture, **changes))
-    with result.files[1].open() as table:
-        first = next(csv.DictReader(table))
-    expected = [float(first[name]) for name in ("length", "return", "cost")]
-    assert shown[-1] == pytest.approx(expected, abs=1e-5)
+    first = pandas.read_csv(result.files[1]).loc[0, ["length", "return", "cost"]]
+    assert draw.call_args.args[1:] == pytest.approx(first.tolist(), abs=1e-5)
