@@ -9,7 +9,6 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from commands import ROOT, composed
@@ -34,21 +33,12 @@ SCHEMAS: dict[str, list] = {
     "export": [ExportOptions, "FILE"],
     "report": [ReportOptions],
 }
-BLOCK = re.compile(
-    r"^(?:<!-- file: (?P<file>\S+) -->\n)?```(?P<language>\w*)\n(?P<text>.*?)^```", re.M | re.S
-)
+BLOCK = re.compile(r"^(?:<!-- file: (\S+) -->\n)?```(\w*)\n(.*?)^```", re.M | re.S)
 
 
-class Block(NamedTuple):
-    """What is fenced: the name of a file or None, a language or "", and the text."""
-
-    file: str | None
-    language: str
-    text: str
-
-
-def blocks(page: str) -> list[Block]:
-    return [Block(*match.groups()) for match in BLOCK.finditer((ROOT / page).read_text())]
+def blocks(page: str) -> list[tuple[str, str, str]]:
+    """What is fenced: the name of a file or "", a language or "", and the text."""
+    return BLOCK.findall((ROOT / page).read_text())
 
 
 def linked(page: str) -> list[str]:
@@ -58,11 +48,9 @@ def linked(page: str) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in places if path.is_file()]
 
 
-def write_files(found: list[Block], place: Path) -> None:
-    for block in found:
-        if block.file:
-            (place / block.file).parent.mkdir(parents=True, exist_ok=True)
-            (place / block.file).write_text(block.text)
+def write_file(place: Path, name: str, text: str) -> None:
+    (place / name).parent.mkdir(parents=True, exist_ok=True)
+    (place / name).write_text(text)
 
 
 def commands(text: str) -> list[list[str]]:
@@ -123,14 +111,16 @@ def check_all(found: list[list[str]], run: Path, page: str) -> None:
 def test_snippets_run_and_commands_are_taken(page, workplace, tiny_run):
     names = {"__name__": "page"}
     for other in linked(page):
-        write_files(blocks(other), workplace)
-    for block in blocks(page):
-        if block.file:
-            write_files([block], workplace)
-        elif block.language == "python" and not page.startswith(TESTED_ELSEWHERE):
-            exec(compile(block.text, page, "exec"), names)
-        elif block.language in ("", "sh", "bash"):
-            check_all(commands(block.text), tiny_run.directory, page)
+        for file, _, text in blocks(other):
+            if file:
+                write_file(workplace, file, text)
+    for file, language, text in blocks(page):
+        if file:
+            write_file(workplace, file, text)
+        elif language == "python" and not page.startswith(TESTED_ELSEWHERE):
+            exec(compile(text, page, "exec"), names)
+        elif language in ("", "sh", "bash"):
+            check_all(commands(text), tiny_run.directory, page)
     check_all(inline(page), tiny_run.directory, page)
 
 
@@ -147,5 +137,5 @@ def test_there_are_commands_and_snippets():
     found = {page: blocks(page) for page in PAGES}
     assert ["train.py", "env=CarPush2"] in inline("docs/environments/suite.md")
     for page in ("docs/start.md", "docs/guides/environment.md", "docs/guides/gymnasium.md"):
-        assert any(block.language == "python" for block in found[page]), page
-        assert sum(len(commands(block.text)) for block in found[page] if not block.file), page
+        assert any(language == "python" for _, language, _ in found[page]), page
+        assert sum(len(commands(text)) for file, _, text in found[page] if not file), page
