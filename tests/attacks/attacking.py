@@ -80,7 +80,6 @@ def said_by(process, patience=300):
 
 
 def kill_all(process):
-    """End a process and all of its group."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()

@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 from attacking import RUN, cases
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from run_configs import compose_config
 
@@ -20,8 +21,6 @@ from safe_rl.training.train import is_expected, train
 MARK = "\x1b[31m"
 # 1e30: torch itself refuses what single precision cannot hold
 VALUES = (None, True, -1, 3, 1e30, float("nan"), "", "x", MARK, "../..", [], [1], {}, {"a": MARK})
-
-
 REPLAY = [word for word in RUN if not word.startswith("critic_update")]
 REPLAY += ["algo=sac_lagrangian", "exploration.random_steps=80", "memory.batch_size=8"]
 REPLAY += ["memory.keep=true", "memory.n_steps=3", "certificate.episodes=0"]
@@ -61,8 +60,8 @@ def replace(random, path):
     elif kind == "json":
         path.write_text(json.dumps(random.choice(VALUES)))
     else:
-        with path.open("wb") as file:
-            file.truncate(2**37)
+        path.touch()
+        os.truncate(path, 2**37)
 
 
 def edited(random, content):
@@ -75,12 +74,8 @@ def edited(random, content):
     if isinstance(content, list) and content and random.random() < 0.7:
         return [edited(random, content[0]), *content[1:]]
     if isinstance(content, torch.Tensor) and random.random() < 0.7:
-        wrong = [
-            content.double() * torch.nan,
-            content.unsqueeze(0),
-            content[:0] if content.ndim else content - 9,
-        ]
-        return random.choice(wrong)
+        shorter = content[:0] if content.ndim else content - 9
+        return random.choice([content.double() * torch.nan, content.unsqueeze(0), shorter])
     return random.choice(VALUES)
 
 
@@ -90,8 +85,6 @@ def edit(random, path):
     elif path.suffix == ".torchrl":
         save_tensors(path, edited(random, load_tensors(path)))
     elif path.suffix == ".yaml":
-        from omegaconf import OmegaConf
-
         content = OmegaConf.to_container(OmegaConf.load(path))
         path.write_text(yaml.safe_dump(edited(random, content)))
     else:

@@ -64,7 +64,6 @@ def test_training_leaves_the_table_of_a_run_that_was_not_killed(tmp_path):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A certified run."""
     folder = tmp_path_factory.mktemp("trained") / "run"
     test = ["certificate.ranking=2", "certificate.episodes=20", "cost_limits={cost: 1000}"]
     train(compose_config(*RUN, "frames=160", *test), folder)

@@ -16,30 +16,18 @@ def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-SIZES = (
-    f"frames={round(max(SCALE, 0.2) * 100) * 10_000}",
-    "num_envs=100",
-    "frames_per_batch=10_000",
-    "checkpoint.interval=2",
-)
-ON_POLICY = (
-    "policy_update.num_passes=1",
-    "critic_update.num_passes=1",
-    "critic_update.minibatch_size=2000",
-)
-OFF_POLICY = (
-    "algo=sac_lagrangian",
-    "memory.capacity=50_000",
-    "policy_update.updates_per_step=0.0002",
-)
-
-
 @pytest.mark.parametrize("kind", ["on-policy", "off-policy"])
 def test_memory_is_flat_over_a_million_steps(kind, tmp_path):
+    frames = round(max(SCALE, 0.2) * 100) * 10_000
+    sizes = [f"frames={frames}", "num_envs=100", "frames_per_batch=10_000"]
+    sizes += ["checkpoint.interval=2"]
     if kind == "on-policy":
-        config = point_mass_config(*SIZES, *ON_POLICY, minibatch_size=2000)
+        sizes += ["policy_update.num_passes=1", "critic_update.num_passes=1"]
+        sizes += ["critic_update.minibatch_size=2000"]
+        config = point_mass_config(*sizes, minibatch_size=2000)
     else:
-        config = off_policy_config(*OFF_POLICY, *SIZES)
+        sizes += ["memory.capacity=50_000", "policy_update.updates_per_step=0.0002"]
+        config = off_policy_config("algo=sac_lagrangian", *sizes)
     seed_everything(0, 1)
     trainer = build_trainer(config, PointMass(100, 20), tmp_path)
     found = []

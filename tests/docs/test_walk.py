@@ -5,12 +5,12 @@ stands there, but for the size of the run: few steps of short episodes, limits t
 keeps, and no certificate but in the first one.
 """
 
-import csv
 import itertools
 import json
 import re
 import shlex
 
+import pandas
 import pytest
 from commands import ROOT, in_a_process, run_train
 
@@ -97,17 +97,13 @@ def test_from_an_environment_and_an_algorithm_of_ones_own_to_the_table(place):
     carry_out(both, place, seeds=True)
     report = command("guides/algorithm.md", "safe-rl report")
     carry_out(report, place)
-    with (place / "runs/report/final_SlowGoal.csv").open(newline="") as file:
-        rows = {row["algorithm"]: row for row in csv.DictReader(file)}
-    assert set(rows) == {"quadratic", "CPO"}
-    assert {row["seeds"] for row in rows.values()} == {"2"}
+    rows = pandas.read_csv(place / "runs/report/final_SlowGoal.csv").set_index("algorithm")
+    assert rows.seeds.to_dict() == {"quadratic": 2, "CPO": 2}
     runs = list(place.glob("runs/SlowGoal/quadratic/**/progress.csv"))
     assert len(runs) == 2
     # what it costs to drive fast is counted beside what was there before
-    with runs[0].open(newline="") as file:
-        assert {"episode_cost_speed", "episode_cost_hazards", "policy_loss_penalty"} <= set(
-            csv.DictReader(file).fieldnames or ()
-        )
+    columns = {"episode_cost_speed", "episode_cost_hazards", "policy_loss_penalty"}
+    assert columns <= set(pandas.read_csv(runs[0]))
 
 
 def test_a_simulator_of_ones_own_is_trained_on(place):
