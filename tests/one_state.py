@@ -48,20 +48,6 @@ def one_state(advantage, *cost_advantages):
     return actor, next(actor.parameters()), batch
 
 
-def best_on_a_grid(loss, logits, batch, points=36):
-    """The policy of three actions of which the loss is lowest, by trying all."""
-    best, best_value = None, torch.inf
-    for i in range(1, points):
-        for j in range(1, points - i):
-            probs = torch.tensor([i, j, points - i - j]) / points
-            with torch.no_grad():
-                logits.copy_(probs.log())
-                value = total(loss(batch)).item()
-            if value < best_value:
-                best, best_value = probs, value
-    return best
-
-
 def minimise(loss, logits, batch):
     """Find the policy of which a loss is lowest."""
     optimizer = torch.optim.LBFGS([logits], max_iter=200, line_search_fn="strong_wolfe")

@@ -55,7 +55,10 @@ _MEANINGS = (
         r"(?s)(?:no attribute|Missing).*full_key: (?!hydra)(\w+)\S*\s+object_type=General",
         "this algorithm has no '{}'.",
     ),
-    (r"'env\.name' not found", "env: the file of an environment needs a line 'name: …'."),
+    (
+        r"'env\.name' not found|Key 'name' .*\s+full_key: env\.name",
+        "env: the file of an environment needs a line 'name: …'.",
+    ),
     (r"Missing mandatory value: (\S+)", "{0} has to be given: {0}=…"),
     (
         r"In '(preset)/(\w+)'.*\s+Key '\w+' not in '\w+'\s+full_key: (\S+)",

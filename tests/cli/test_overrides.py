@@ -1,9 +1,12 @@
 """Words on the command line: a wrong one is refused in one line that names what was meant."""
 
+import re
+
 import pytest
 from commands import composed, status_of
 
 from safe_rl.cli import train
+from safe_rl.cli.composing import compose_run
 from safe_rl.files import CONF
 from safe_rl.scores.benchmark import SLATES
 
@@ -147,8 +150,10 @@ def test_a_file_of_ones_own_may_come_before_that_of_the_package(tmp_path):
 def test_a_file_of_an_environment_without_its_name(tmp_path):
     (tmp_path / "env").mkdir()
     (tmp_path / "env" / "nameless.yaml").write_text("_target_: mine.make\n")
-    said = status_of(f"--config-dir={tmp_path}", "env=nameless")
-    assert said == "env: the file of an environment needs a line 'name: …'."
+    told = "env: the file of an environment needs a line 'name: …'."
+    assert status_of(f"--config-dir={tmp_path}", "env=nameless") == told
+    with pytest.raises(ValueError, match=f"^{re.escape(told)}$"):
+        compose_run(["env=nameless"], [tmp_path])
 
 
 def test_an_id_with_a_namespace_names_one_folder():
