@@ -1,4 +1,4 @@
-"""States in which something happens: where things are, and how they are put there."""
+"""States in which something happens, how they are reached, and runs to be compared."""
 
 import math
 
@@ -85,3 +85,23 @@ def observe(env, **poses: tuple[float, ...]) -> dict[str, np.ndarray]:
     """Every component of the first world's observation of an arrangement."""
     flat = env.set_state(arrange(env, **poses))["observation"][0].double().numpy()
     return {name: flat[columns] for name, columns in env.observation_layout.items()}
+
+
+def play(env, start: TensorDict, num_steps: int) -> TensorDict:
+    """All outputs of a run with resets [N, T]; row k gets the same actions whatever N is."""
+    num_envs, size = env.action_spec.shape
+    rows = [
+        2 * torch.rand(num_steps, size, generator=torch.Generator().manual_seed(row)) - 1
+        for row in range(num_envs)
+    ]
+    steps, tensordict = [], start
+    for action in torch.stack(rows, 1) * env.action_spec.space.high[0]:
+        following, tensordict = env.step_and_maybe_reset(tensordict.set("action", action))
+        steps.append(following["next"].clone())
+    return torch.stack(steps, 1)
+
+
+def assert_same(a: TensorDict, b: TensorDict) -> None:
+    assert set(a.keys(True, True)) == set(b.keys(True, True))
+    for key, value in a.items(True, True):
+        assert torch.equal(value, b[key]), key

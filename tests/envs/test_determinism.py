@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 import torch
-from playing import assert_same, play
+from crafting import assert_same, play
 
 from safe_rl.envs import SafetyGymEnv, resolve
 from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv, resolve_velocity

@@ -1,9 +1,11 @@
-"""Scaled dynamics, against models that MuJoCo compiles from files with the numbers multiplied."""
+"""Scaled dynamics against models that MuJoCo compiles; noise on controls and substeps."""
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+from crafting import make
+from scipy.stats import binom, chisquare, kstest, pearsonr
 
 from safe_rl.envs import ConfigError, SafetyGymEnv, make_env
 from safe_rl.envs.physics.dynamics import SCALES, scale_dynamics
@@ -150,3 +152,54 @@ def test_a_range_that_cannot_be_drawn_from_is_refused():
     state["dynamics"] = torch.ones(1, 2)
     with pytest.raises(ValueError, match="State 'dynamics' must have shape"):
         env.set_state(state)
+
+
+POINT = {"robot_base": "point", "task": "none", "observe_sensors": False, "observe_ctrl": True}
+NUM_ENVS = 2000
+
+
+def controls(env, action: tuple[float, float]) -> np.ndarray:
+    """The controls that a step applies [N, 2]."""
+    request = env.reset().set("action", torch.tensor(action).expand(env.batch_size[0], 2))
+    return env.step(request)["next", "observation"].double().numpy()
+
+
+def test_noise_is_added_to_the_clipped_control():
+    got = controls(make({**POINT, "action_noise": 0.3}, NUM_ENVS), (0.2, 5.0))
+    for column, mean in ((0, 0.2), (1, 1.0)):
+        assert kstest((got[:, column] - mean) / 0.3, "norm").pvalue > 1e-3
+    assert abs(pearsonr(got[:, 0], got[:, 1]).statistic) < 0.1
+
+
+def test_noise_is_new_in_every_row_and_step_and_with_every_seed():
+    nothing, drawn = torch.zeros(50, 2), []
+    for seed in (0, 1):
+        env = make({**POINT, "action_noise": 0.1}, 50, seed=seed)
+        steps = env.rollout(2, lambda td: td.set("action", nothing))["next", "observation"]
+        drawn.append(steps.flatten(0, 1))
+    assert len(torch.cat(drawn).unique(dim=0)) == 2 * 50 * 2
+
+
+def test_substeps_are_binomial():
+    env = make({**POINT, "frameskip_binom_n": 4, "frameskip_binom_p": 0.7}, NUM_ENVS)
+    env.step(env.reset().set("action", torch.zeros(NUM_ENVS, 2)))
+    # a substep of the Point takes 2 ms
+    counts = np.bincount(np.rint(env.get_state()["time"].numpy() / 0.002).astype(int), minlength=5)
+    assert chisquare(counts, NUM_ENVS * binom.pmf(np.arange(5), 4, 0.7)).pvalue > 1e-3
+
+
+def test_worlds_with_fewer_substeps_and_gremlins_do_what_a_plain_world_does():
+    gremlins = {"gremlins_num": 2, "frameskip_binom_n": 6, "frameskip_binom_p": 0.5}
+    env = make({**POINT, **gremlins}, 12)
+    env.rollout(3)
+    before, action = env.get_state(), env.action_spec.rand()
+    env.step(env.set_state(before).set("action", action))
+    after = env.get_state()
+    numbers = ((after["time"] - before["time"]) / 0.002).round().int()
+    assert len(numbers.unique()) > 2
+    for number in range(1, 7):
+        plain = make({**POINT, "gremlins_num": 2, "frameskip_binom_n": number}, 12)
+        plain.step(plain.set_state(before).set("action", action))
+        rows = numbers == number
+        got, want = after["qpos"][rows], plain.get_state()["qpos"][rows]
+        torch.testing.assert_close(got, want, rtol=0, atol=1e-9)

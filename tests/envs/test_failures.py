@@ -3,11 +3,12 @@
 import math
 import multiprocessing
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
-from safe_rl.envs import ConfigError, SafetyGymEnv, env_node, make_env
+from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv, env_node, make_env
 
 BROKEN, NUM_ENVS = 1, 4
 
@@ -110,7 +111,6 @@ WRONG_CONFIGS = {
     "nothing observed": ({"observe_sensors": False}, "observe_"),
     "no boundary": ({"constrain_boundary": True}, "needs 'boundary_x', 'boundary_y'"),
     "no speed": ({"constrain_velocity": True}, "'constrain_velocity' needs 'velocity_limit'"),
-    "two starts": ({"robot_locations": [[0, 0], [1, 1]]}, "'robot_locations' has 2 .* for 1 obj"),
     "no hazards": ({"hazards_locations": [[0, 0]]}, "'hazards_locations' has 1 .* for 0 objects"),
     "idle boundary": ({"boundary_x": 1.0}, "'boundary_x' has no effect.*'constrain_boundary'"),
     "idle limit": ({"velocity_limit": 1.0}, "'velocity_limit' has no effect.*'constrain_vel"),
@@ -192,3 +192,35 @@ def test_a_fork_with_threads_is_an_error_instead_of_a_hang():
     finally:
         child.kill()
         child.join(300)
+
+
+def test_a_file_of_ones_own_is_not_taken_for_the_bundled_one(tmp_path, monkeypatch):
+    (tmp_path / "xmls").mkdir()
+    (tmp_path / "xmls" / "car.xml").write_text("<mujoco/>")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"xmls/car\.xml has no body"):
+        SafetyGymEnv({"robot_base": "xmls/car.xml"})
+
+
+def test_more_locations_than_objects_are_told_and_ignored():
+    keys = {"robot_base": "point", "hazards_num": 1, "hazards_locations": [[1, 0], [0, 1]]}
+    with pytest.warns(UserWarning, match="'hazards_locations' has 2 locations for 1 objects"):
+        env = SafetyGymEnv(keys, num_threads=1)
+    env.reset()
+    assert env.get_positions()["hazards"][0, :, :2].tolist() == [pytest.approx([1, 0], abs=1e-6)]
+
+
+def test_values_of_numpy_are_those_of_python():
+    given = {
+        **{"hazards_num": np.int64(3), "num_steps": np.float32(7.0), "task": np.str_("push")},
+        **{"constrain_hazards": np.True_, "goal_size": np.float64(0.5)},
+        **{"placements_extents": np.array([-3, -3, 3, 3]), "sensors_obs": np.array(["gyro"])},
+    }
+    plain = {key: value.tolist() for key, value in given.items()}
+    config = SafetyGymConfig(**given)
+    assert config == SafetyGymConfig(**plain)
+    assert {type(config.hazards_num), type(config.num_steps)} == {int}
+    assert config.constrain_hazards is True
+    for wrong in ({"hazards_num": np.True_}, {"lidar_alias": np.int8(1)}):
+        with pytest.raises(ConfigError):
+            SafetyGymConfig(**wrong)

@@ -63,16 +63,7 @@ def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does
         make_env(node, num_envs=4)
 
 
-@pytest.mark.parametrize(
-    "name", ["Safexp-PointGoal1-v0", "SafeHopperVelocity", {"robot_base": "car"}, "torchrl"]
-)
-def test_keys_change_an_environment_of_any_family(name):
-    torchrl = {"id": "PendulumEnv", "outside": {"cost_angle": ["th", -1, 1]}}
-    keys = {"num_steps": 6, **(torchrl if name == "torchrl" else {})}
-    assert make_env(name, num_envs=2, seed=0, **keys).max_episode_steps == 6
-
-
-@pytest.mark.parametrize("name", ["PointGoal1", "SafeHopperVelocity"])
+@pytest.mark.parametrize("name", ["Safexp-PointGoal1-v0", "SafeHopperVelocity"])
 def test_a_changed_configuration_is_made_and_stored(name):
     changed = make_env(name, seed=0).config.replace(num_steps=7)
     assert make_env(changed, num_envs=2, seed=0).config == changed

@@ -8,7 +8,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from safe_rl.envs import ConfigError, SafetyGymConfig, SafetyGymEnv
-from safe_rl.envs.safety_gym.config import KEYS
 from safe_rl.envs.safety_gym.config_keys import Keys
 
 often = settings(
@@ -169,8 +168,3 @@ def test_placements_smaller_than_the_keepout_name_their_key(kind, keepout):
         config["task"] = "push"
     with pytest.raises(ConfigError, match=rf"'{kind}_placements'.*'{kind}_keepout'"):
         SafetyGymEnv(config)
-
-
-def test_every_key_has_a_row_that_says_what_it_is():
-    assert {name: row.default for name, row in KEYS.items()} == SafetyGymConfig().to_dict()
-    assert all(len(row.meaning) > 4 for row in KEYS.values())

@@ -1,16 +1,19 @@
-"""Keys registered from outside the package: validation, pickling, Hydra, and refused rows."""
+"""Keys and environments registered from outside: Hydra, refused rows, the example's commands."""
 
 import pickle
+import runpy
 from dataclasses import replace
 
 import pytest
 import torch
+from commands import ROOT, SMALL, in_a_process, status_of
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 from registrations import POINT, disc, register_mines
 from run_configs import CONF
 
+from safe_rl.cli.evaluate import main as evaluate
 from safe_rl.envs import (
     ConfigError,
     SafetyGymConfig,
@@ -28,6 +31,7 @@ from safe_rl.envs.extending import (
     register_observation,
     register_task,
 )
+from safe_rl.runs.table import read_table
 
 pytestmark = pytest.mark.usefixtures("registrations_undone")
 
@@ -106,3 +110,35 @@ def test_names_that_meet_an_observation_are_refused():
     register_observation(Reading("gyro", (), lambda c, s: 1, lambda w: w.up[:, None]))
     with pytest.raises(ConfigError, match=r"Two observations.*'gyro'"):
         SafetyGymEnv(POINT)
+
+
+EXAMPLE = "examples/custom_environment.py"
+MINES = ("env=PointMines", "cost_limits={cost_mines: 10}", "env.mines_num=8")
+
+
+@pytest.mark.long
+def test_the_example_is_trained_resumed_and_evaluated_by_the_ordinary_commands(
+    tmp_path, monkeypatch
+):
+    # with a worker, which has to import it too
+    worker = ("collector=process", "collector.num_collectors=1")
+    begun = (*MINES, *SMALL, "frames=80", f"hydra.run.dir={tmp_path}")
+    in_a_process("train.py", f"import={EXAMPLE}", *begun, *worker)
+    assert "estimate_cost_mines" in read_table(tmp_path / "progress.csv")
+    monkeypatch.chdir(ROOT)
+    resume = (f"resume={tmp_path}", "frames=160")
+    assert f"was trained with import={EXAMPLE}: add that to the command" in str(status_of(*resume))
+    assert status_of(*resume, f"import={EXAMPLE}") == 0
+    assert evaluate([str(tmp_path), "episodes=2", f"import={EXAMPLE}"]) == 0
+    assert read_table(tmp_path / "progress.csv")["steps"] == [40, 80, 120, 160]
+    assert "cost_mines" in (tmp_path / "evaluation.json").read_text()
+
+
+@pytest.mark.long
+def test_robots_meet_the_mines_of_the_example():
+    config = runpy.run_path(str(ROOT / EXAMPLE))["POINT_MINES"]
+    env = SafetyGymEnv(config, num_envs=50, seed=0, num_threads=1)
+    assert {"mines_lidar", "speed"} <= env.observation_layout.keys()
+    rollout = env.rollout(200)
+    assert 0 < float((rollout["next", "cost_mines"] > 0).float().mean()) < 0.5
+    assert float(rollout["next", "cost_mines"].max()) <= 1.0

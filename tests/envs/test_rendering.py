@@ -25,13 +25,6 @@ KINDS = {
     "pillar": ((-0.3, -1.5), (0.5, 0.5, 1)),
     "gremlin": ((1.0, -1.1), (0.5, 0, 1)),
 }
-ON_HAZARD = {
-    "hazards_num": 1,
-    "hazards_locations": [(0.0, 0.0)],
-    "hazards_keepout": 0.0,
-    "robot_keepout": 0.0,
-    "constrain_hazards": True,
-}
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +101,8 @@ def test_drawing_changes_nothing(name):
 @pytest.mark.parametrize(("bearing", "yaw"), [(0.2, 0.0), (1.9, 2.5)])
 def test_halos_are_lit_towards_the_object(bearing, yaw, lidar_type):
     pillar = (1.5 * math.cos(bearing), 1.5 * math.sin(bearing))
-    config = {
-        "robot_rot": yaw,
-        "pillars_num": 1,
-        "pillars_locations": [pillar],
-        "observe_pillars": True,
-        "lidar_type": lidar_type,
-        "lidar_num_bins": 32,
-    }
+    config = {"pillars_num": 1, "pillars_locations": [pillar], "observe_pillars": True}
+    config |= {"robot_rot": yaw, "lidar_type": lidar_type, "lidar_num_bins": 32}
     view = {"camera": from_above(0.0, 0.0, 1.6), "width": 200, "height": 200}
     with_halo = make_env(config).render(0, **view).astype(float)
     without = make_env(config, render_lidar_markers=False).render(0, **view).astype(float)
@@ -130,7 +117,8 @@ def test_halos_are_lit_towards_the_object(bearing, yaw, lidar_type):
 
 @needs_opengl
 def test_a_red_sphere_is_shown_while_a_cost_is_incurred():
-    env = make_env(ON_HAZARD)
+    hazard = {"hazards_num": 1, "hazards_locations": [(1.0, 0.0)], "hazards_size": 1.5}
+    env = make_env({**hazard, "constrain_hazards": True})
     beside = (-0.17, 0.0)
     assert redness(colour_at(env, *beside)) < 0.1
     assert env.step(env.full_action_spec.zero())["next", "cost"].item() == 1

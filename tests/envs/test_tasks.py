@@ -113,3 +113,26 @@ def test_every_row_keeps_its_specs_and_lasts_500_steps(name):
     assert xy.abs().max() <= half + 1e-6
     expected = {"cost", "cost_boundary", "cost_exception"}
     assert set(env.cost_keys) == expected | ({"cost_velocity"} if "Run" in name else set())
+
+
+@pytest.mark.parametrize("clip", [0, None, 0.5])
+def test_a_clip_of_0_is_none(clip):
+    keys = {"robot_base": "point", "reward_distance": 1e4, "reward_clip": clip}
+    env = SafetyGymEnv(keys, num_envs=3, seed=0, num_threads=1)
+    env.reset()
+    reward = env.rand_step(env.reset())["next", "reward"].abs()
+    assert (reward == 0.5).all() if clip else (reward > 0.5).all()
+
+
+@pytest.mark.parametrize("task", ["circle", "none"])
+def test_the_goal_of_tasks_without_one_is_the_origin(task):
+    keys = {"robot_base": "point", "task": task, "robot_rot": 0.0, "robot_locations": [[0.3, -0.4]]}
+    keys |= {"observe_goal_lidar": True, "observe_goal_comp": True, "observe_goal_dist": True}
+    env = SafetyGymEnv({**keys, "lidar_alias": False}, num_envs=1, seed=0, num_threads=1)
+    seen, layout = env.reset()["observation"][0], env.observation_layout
+    assert "goal" not in env.object_names
+    near = math.exp(-0.5)
+    assert seen[layout["goal_dist"]].item() == pytest.approx(near)
+    assert seen[layout["goal_compass"]].tolist() == pytest.approx([-0.6, 0.8], abs=2e-3)
+    # to the left and behind, at 126.9 degrees: in the fourth bin of 36 degrees
+    assert seen[layout["goal_lidar"]].tolist() == pytest.approx([0, 0, 0, near] + [0] * 6)

@@ -23,6 +23,7 @@ TARGET = "safe_rl.envs.torchrl.make_torchrl"
 OUTSIDE = {"cost_speed": ["thdot", -4, 4]}
 PENDULUM = {"_target_": TARGET, "id": "PendulumEnv", "num_steps": 30, "outside": OUTSIDE}
 RUNNER = {"_target_": TARGET, "id": "torchrl_envs.Runner", "num_steps": 5}
+ENDS = RUNNER | {"id": "torchrl_envs.Ends"}
 SMALL = (
     *("env=torchrl", "env.id=PendulumEnv", "env.num_steps=20", "num_envs=4"),
     *("frames_per_batch=160", "logger=none", "model.hidden_sizes=[8]", "num_threads=1"),
@@ -163,8 +164,7 @@ def test_what_cannot_be_made_is_said(keys, message):
 
 @pytest.mark.parametrize("flag", ["done", "terminated"])
 def test_an_end_that_one_flag_tells_is_a_termination(flag, trusted):
-    ends = RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5, "kwargs": {"flag": flag}}
-    env = make_env(ends, num_envs=2, seed=0)
+    env = make_env(ENDS | {"kwargs": {"flag": flag}}, num_envs=2, seed=0)
     steps = env.rollout(6, break_when_any_done=False)["next"]
     for name in ("done", "terminated"):
         assert steps[name][0].flatten().tolist() == [False, True] * 3
@@ -173,8 +173,7 @@ def test_an_end_that_one_flag_tells_is_a_termination(flag, trusted):
 def test_rewards_of_integers_can_be_changed_by_transforms(trusted):
     node = {"_target_": "safe_rl.envs.transforms.Saute", "budgets": {"cost": 1.5}}
     node |= {"discount": 1.0, "unsafe_reward": -0.5, "rescale_budgets": False}
-    ends = RUNNER | {"id": "torchrl_envs.Ends", "num_steps": 5}
-    env = make_env(ends, num_envs=1, seed=0, transforms={"saute": node})
+    env = make_env(ENDS, num_envs=1, seed=0, transforms={"saute": node})
     check_env_specs(env)
     assert env.rollout(2)["next", "reward"].flatten().tolist() == [1.0, -0.5]
 
@@ -186,8 +185,7 @@ def test_an_environment_may_have_transforms_of_its_own(trusted):
 
 
 def test_an_entry_that_a_step_leaves_out_is_not_that_of_an_earlier_step(trusted):
-    ends = RUNNER | {"id": "torchrl_envs.Ends", "kwargs": {"silent": True}}
-    env = make_env(ends, num_envs=2, seed=0)
+    env = make_env(ENDS | {"kwargs": {"silent": True}}, num_envs=2, seed=0)
     with pytest.raises(ConfigError, match=r"Ends: a step wrote no 'cost_effort'.*in every step"):
         env.rollout(2)
 

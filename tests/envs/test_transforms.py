@@ -69,16 +69,15 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
     env = transformed(Priced(costs), saute=Saute(budgets, **SAUTE))
     assert env.observation_layout["budget"] == slice(4, 6)
     batch = still(env, 7)  # an episode of 5 steps and two of the next one
-    for row in range(2):
-        for column, (factor, d) in enumerate([(1, 4.0), (2, 40.0)]):
-            z, after = 1.0, []
-            for step in range(7):
-                z = 1.0 if step == 5 else z
-                assert batch["observation"][row, step, 4 + column].item() == pytest.approx(z)
-                z = (z - factor * costs[row][step % 5] / d) / 0.9
-                after.append(z)
-            found = batch["next", "observation"][row, :, 4 + column]
-            assert found.tolist() == pytest.approx(after)
+    shares = torch.tensor(costs).unsqueeze(-1) * torch.tensor([1 / 4, 2 / 40])
+    before, after = [], []
+    for step in range(7):
+        before.append(torch.ones(2, 2) if step in (0, 5) else after[-1])
+        after.append((before[-1] - shares[:, step % 5]) / 0.9)
+    for seen, left in ((batch, before), (batch["next"], after)):
+        torch.testing.assert_close(
+            seen["observation"][..., 4:], torch.stack(left, 1), rtol=1e-6, atol=1e-12
+        )
 
 
 def test_rows_that_continue_keep_their_budget_when_others_begin():
@@ -299,53 +298,45 @@ def test_nodes_are_built_and_their_keys_named():
         make_env("PointGoal1", transforms={"n": {"_target_": "transforming.normed"}})
 
 
-def filtered(function, **keys):
-    return transformed(PointMass(1), f=ActionFilter(function, **keys))
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [
         (lambda: Saute({}, **SAUTE), "budgets={}: .*at least 1 item"),
         (lambda: Saute({"cost": 0.0}, **SAUTE), "greater than 0"),
         (lambda: EarlyTermination({"cost": math.nan}), "a finite number"),
-        (lambda: transformed(PointMass(1), "saute", "simmer"), "one of saute and simmer"),
         (lambda: ActionRepeat(0), "k=0: it must be greater"),
-        (
-            lambda: filtered(lambda step: step["action"][:, :1]).rollout(1),
-            r"actions of shape \(1, 2\), got \(1, 1\)",
-        ),
-        (
-            lambda: filtered(lambda step, positions: step["action"]).rollout(1),
-            "parameter 'positions'",
-        ),
-        (
-            lambda: transformed(PointMass(1), r=ActionRepeat(2), o=ObservedCosts(0.5)),
-            r"'r' has to be the last one.*transforms=\[o,r\]",
-        ),
-        (
-            lambda: transformed(PointMass(1), a=ActionRepeat(2), b=ActionRepeat(3)),
-            "'a' and 'b' hold actions: choose one",
-        ),
-        (lambda: transformed(PointMass(1), o=ObservedCosts(0.5, ["coast"])), "no cost 'coast'"),
-        *(
-            (lambda t=t: TransformedEnv(PointMass(1), t).rollout(1), "no cost 'coast'")
-            for t in (ObservedCosts(0.5, ["coast"]), EarlyTermination({"coast": 5.0}))
-        ),
-        *(
-            (lambda t=t: transformed(PointMass(1), t=t), r"t: There is no cost 'coast'")
-            for t in (EarlyTermination({"coast": 5.0}), Saute({"coast": 5.0}, **SAUTE))
-        ),
-        *(
-            (lambda key=key: filtered(half_speed, cost_key=key), f"f: cost_key={key}: choose anot")
-            for key in ("cost", "cost_north", "reward")
-        ),
+        (lambda: transformed(PointMass(1), "saute", "simmer"), "one of saute and simmer"),
         (
             lambda: transformed("dictionary", o=ObservedCosts(0.5)).observation_spec,
             "observed_costs adds columns",
+        ),
+        *(
+            (lambda t=t: TransformedEnv(PointMass(1), t).rollout(1), "no cost 'coast'")
+            for t in (ObservedCosts(0.5, ["coast"]), EarlyTermination({"coast": 5.0}))
         ),
     ],
 )
 def test_what_cannot_be_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+@pytest.mark.parametrize(
+    ("transforms", "words"),
+    [
+        ({"f": ActionFilter(lambda step: torch.ones(1, 1))}, r"shape \(1, 2\), got \(1, 1\)"),
+        ({"f": ActionFilter(lambda step, positions: positions)}, "parameter 'positions'"),
+        *(
+            ({"f": ActionFilter(half_speed, cost_key=key)}, f"f: cost_key={key}: choose another")
+            for key in ("cost", "cost_north", "reward")
+        ),
+        ({"r": ActionRepeat(2), "o": ObservedCosts(0.5)}, r"'r' has to be the last one.*=\[o,r\]"),
+        ({"a": ActionRepeat(2), "b": ActionRepeat(3)}, "'a' and 'b' hold actions: choose one"),
+        ({"o": ObservedCosts(0.5, ["coast"])}, "o: There is no cost 'coast'"),
+        ({"e": EarlyTermination({"coast": 5.0})}, "e: There is no cost 'coast'"),
+        ({"s": Saute({"coast": 5.0}, **SAUTE)}, "s: There is no cost 'coast'"),
+    ],
+)
+def test_transforms_that_do_not_fit_are_refused(transforms, words):
+    with pytest.raises(ValueError, match=words):
+        transformed(PointMass(1), **transforms).rollout(1)

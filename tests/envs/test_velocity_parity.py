@@ -1,4 +1,7 @@
-"""Observation, reward and termination are Gymnasium's, costs are Safety-Gymnasium's."""
+"""Keys, observation, reward and termination are Gymnasium's, costs are Safety-Gymnasium's."""
+
+import inspect
+import math
 
 import gymnasium
 import mujoco
@@ -8,7 +11,10 @@ import torch
 from scipy.stats import ks_2samp, kstest, uniform
 from tensordict import TensorDict
 
-from safe_rl.envs.velocity import VelocityEnv, resolve_velocity
+from safe_rl.envs.keys import ConfigError
+from safe_rl.envs.physics.dynamics import SCALES
+from safe_rl.envs.velocity import VELOCITY_SUITE, VelocityEnv, resolve_velocity
+from safe_rl.envs.velocity.velocity_config import RUNNERS
 
 # Names, Gymnasium's ids, and the thresholds that Safety-Gymnasium 1.0 publishes.
 FAMILY = {
@@ -142,3 +148,35 @@ def test_starts_are_distributed_as_gymnasiums(name):
     noise = ours[:, : len(other.init_qpos)] - other.init_qpos
     scale = resolve_velocity(name).reset_noise_scale
     assert kstest(noise.ravel() / scale, uniform(-1, 2).cdf).pvalue > 1e-3
+
+
+OURS = {"robot", "velocity_threshold", "num_steps", "physics", "physics_buffers", *SCALES}
+THEIRS = {"xml_file", "default_camera_config", "main_body", "kwargs", "self"}
+
+
+@pytest.mark.parametrize("name", VELOCITY_SUITE)
+def test_keys_and_defaults_are_gymnasiums(name):
+    config = resolve_velocity(name)
+    made = gymnasium.make(RUNNERS[config.robot].gymnasium_id).unwrapped
+    parameters = inspect.signature(type(made).__init__).parameters
+    defaults = {key: row.default for key, row in parameters.items() if key not in THEIRS}
+    ours = {key: value for key, value in config.to_dict().items() if key not in OURS}
+    assert ours == defaults
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("SafeHoperVelocity", "Did you mean 'SafeHopperVelocity'"),
+        ({"frame_skip": 2}, "'robot' must be one of"),
+        ({"robot": "hoper"}, "Did you mean 'hopper'"),
+        ({"robot": "hopper", "velocity_treshold": 1.0}, "Did you mean 'velocity_threshold'"),
+        ({"robot": "swimmer", "healthy_reward": 1.0}, "'swimmer' has no key"),
+        ({"robot": "hopper", "frame_skip": 0}, "frame_skip=0: it must be greater"),
+        ({"robot": "hopper", "healthy_reward": math.inf}, "must be a finite number"),
+        ({"robot": "hopper", "healthy_z_range": [2.0, 1.0]}, "lowest <= highest"),
+    ],
+)
+def test_mistakes_are_named(given, message):
+    with pytest.raises(ConfigError, match=message):
+        resolve_velocity(given)
