@@ -41,14 +41,6 @@ def places(env, state: TensorDict) -> dict[str, torch.Tensor]:
     return found
 
 
-def after_random_steps(env, num_steps: int) -> TensorDict:
-    """The state after a reset and some steps of random actions."""
-    tensordict = env.reset()
-    for _ in range(num_steps):
-        tensordict = env.step_mdp(env.step(env.rand_action(tensordict)))
-    return env.get_state()
-
-
 def arrange(env, **poses: tuple[float, ...]) -> TensorDict:
     """The present state with the robot and objects put at (x, y) or (x, y, yaw), at rest.
 

@@ -101,8 +101,8 @@ def test_they_are_placed_by_their_root(make, xml, yaw):
     assert float(turned) == pytest.approx(0.9)
     if not yaw:
         assert float(qpos[2]) == pytest.approx(0.12)
-    position = env._world.robot_pos[0]
-    np.testing.assert_allclose(position[:2], [1.5, -0.5], atol=1e-8)
+    position = env.get_positions()["robot"][0, 0, :2]
+    np.testing.assert_allclose(position, [1.5, -0.5], atol=1e-8)
 
 
 def test_actions_have_the_range_of_the_actuators(make):
@@ -205,13 +205,10 @@ SLOW_MOTOR = {
 @pytest.mark.parametrize("kind", SLOW_MOTOR)
 def test_what_actuators_remember_is_part_of_a_state(make, kind):
     tag, keys = SLOW_MOTOR[kind]
-    drive = '<motor name="drive"'
-    assert drive in DISC
-    env = make(DISC.replace(drive, f'<{tag} {keys} name="drive"'), sensors_obs=["speed"])
-    idle = torch.zeros(2, 3)
-    here = env.reset()
-    for _ in range(10):
-        here = env.step(here.set("action", torch.ones(2, 3)))["next"]
+    xml = changed(DISC, '<motor name="drive"', f'<{tag} {keys} name="drive"')
+    env = make(xml, sensors_obs=["speed"])
+    idle, drive = torch.zeros(2, 3), torch.ones(2, 3)
+    here = env.rollout(10, lambda td: td.set("action", drive))[:, -1]["next"]
     state = env.get_state()
     if kind == "filter":  # 100 substeps of Euler's
         remembered = torch.full((2,), 1 - (1 - 0.004 / 0.5) ** 100, dtype=torch.float64)

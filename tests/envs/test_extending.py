@@ -58,13 +58,10 @@ def test_static_bodies_stop_the_robot_and_contacts_can_cost():
     )
     register_cost(cost, keys={"constrain_bollards": False})
     env = make({"bollards_num": 1, "constrain_bollards": True})
-    tensordict = env.set_state(arrange(env, robot=(0, 0, 0), bollard0=(0.6, 0)))
-    costs = []
-    for _ in range(150):
-        tensordict["action"] = torch.tensor([[1.0, 0.0]])
-        tensordict = env.step(tensordict)
-        costs.append(float(tensordict["next", "cost_bollards"]))
-        tensordict = env.step_mdp(tensordict)
+    start = env.set_state(arrange(env, robot=(0, 0, 0), bollard0=(0.6, 0)))
+    forwards = lambda td: td.set("action", torch.tensor([[1.0, 0.0]]))  # noqa: E731
+    taken = env.rollout(150, forwards, auto_reset=False, tensordict=start)
+    costs = taken["next", "cost_bollards"].flatten().tolist()
     # The robot's arrow reaches 0.15 m ahead, the bollard 0.1 m back.
     assert float(env.get_state()["qpos"][0, 0]) == pytest.approx(0.6 - 0.1 - 0.15, abs=5e-3)
     assert costs[0] == 0.0
@@ -146,10 +143,9 @@ def test_guided_bodies_run_circles_of_their_own():
     register_element(cube("drones", "drone", Motion.GUIDED, group=5), keys={"drones_travel": 0.6})
     env = make({"drones_num": 1, "gremlins_num": 1, "robot_locations": [[9, 9]]})
     assert env.object_names == ("gremlin0", "drone0")
-    tensordict, radii = env.reset(), []
+    radii = []
     for _ in range(400):
-        tensordict["action"] = torch.zeros(1, 2)
-        tensordict = env.step_mdp(env.step(tensordict))
+        env.step(env.full_action_spec.zero())
         state = env.get_state()
         offset = state["qpos"][0, 3:].view(2, 7)[:, :2] - state["layout"][0, 1:]
         radii.append(offset.norm(dim=-1))
@@ -161,12 +157,8 @@ def test_guided_bodies_run_circles_of_their_own():
     torch.testing.assert_close(heights, torch.tensor([0.2, 0.2]).double(), atol=5e-3, rtol=0)
 
 
-def follow(config, world, before, now) -> torch.Tensor:
-    return config.reward_follow * (before - now)[:, 0]
-
-
 FOLLOW = Task(
-    reward=follow,
+    reward=lambda c, w, before, now: c.reward_follow * (before - now)[:, 0],
     measure=lambda w: (w.at("beacon")[:, :, :2] - w.robot_pos[:, None, :2]).norm(dim=-1),
     elements=("beacon",),
 )

@@ -82,40 +82,33 @@ def test_rectangles_are_chosen_in_proportion_to_their_areas():
     assert stats.chisquare(counts, 4000 * areas / areas.sum()).pvalue > UNLIKELY
 
 
-def fits(xy: np.ndarray, placed: list[np.ndarray], clearances: list[float]) -> bool:
-    pairs = zip(placed, clearances, strict=True)
-    return all(math.dist(xy, other) >= clearance for other, clearance in pairs)
-
-
-def by_rejection(rng, keepouts: list[float], half: float) -> np.ndarray | None:
-    """One layout by the rule itself: place one after the other, 100 tries each."""
-    placed: list[np.ndarray] = []
-    for keepout in keepouts:
-        clearances = [keepout + theirs for theirs in keepouts[: len(placed)]]
-        tries = (rng.uniform(keepout - half, half - keepout, 2) for _ in range(100))
-        found = next((xy for xy in tries if fits(xy, placed, clearances)), None)
-        if found is None:
-            return None
-        placed.append(found)
-    return np.array(placed)
+def draw(rng, keepouts: dict, name: str, placed: dict, half: float, tries: int = 100):
+    """The first of some places that keeps the distances to what is placed, or None."""
+    mine = keepouts[name]
+    for _ in range(tries):
+        xy = rng.uniform(mine - half, half - mine, 2)
+        if all(math.dist(xy, there) >= mine + keepouts[one] for one, there in placed.items()):
+            return xy
+    return None
 
 
 def by_the_rule(rng, keepouts: dict[str, float], half: float, number: int) -> dict:
-    """Many layouts, drawn again where something does not fit; then the first goals, once more."""
-    layouts: list[np.ndarray] = []
-    names, sizes = list(keepouts), list(keepouts.values())
-    goal, mine = names.index("goal"), keepouts["goal"]
+    """Many layouts: one thing after the other, all again where one does not fit.
+
+    Then the first goals are drawn once more.
+    """
+    layouts: list[dict] = []
     while len(layouts) < number:
-        layout = by_rejection(rng, sizes, half)
-        if layout is None:
-            continue
-        others = np.delete(layout, goal, axis=0)
-        clearances = [mine + theirs for theirs in np.delete(sizes, goal)]
-        while not fits(xy := rng.uniform(mine - half, half - mine, 2), others, clearances):
-            pass
-        layout[goal] = xy
-        layouts.append(layout)
-    return dict(zip(names, np.array(layouts).transpose(1, 0, 2), strict=True))
+        placed: dict = {}
+        for name in keepouts:
+            placed[name] = draw(rng, keepouts, name, placed, half)
+            if placed[name] is None:
+                break
+        else:
+            del placed["goal"]
+            placed["goal"] = draw(rng, keepouts, "goal", placed, half, tries=10_000)
+            layouts.append(placed)
+    return {name: np.array([layout[name] for layout in layouts]) for name in keepouts}
 
 
 def test_crowded_layouts_are_distributed_as_by_the_rule_itself():
@@ -179,6 +172,7 @@ def test_pinned_layouts():
     for name, xy in pins.items():
         offset = found.pop(name) - torch.tensor(xy, dtype=torch.float64)
         assert offset.abs().max() <= 1e-9, name
+    assert (env.get_positions()["goal"][:, 0, :2] - 1).abs().max() <= 1e-9
     assert (found.pop("hazard1").std(0) > 0.5).all()
     assert not found
     # Robot, then per body x, y, z and a quaternion about z: vases, box.

@@ -1,8 +1,5 @@
 """Names that environments are made by: the families', what is stored, and what is not known."""
 
-import sys
-import types
-
 import gymnasium_envs  # noqa: F401, registers Walk-v0
 import pytest
 from hydra.core.config_store import ConfigStore
@@ -30,12 +27,7 @@ def make_small(config, *, num_envs, **others):
     return VelocityEnv({"robot": "hopper", **config}, num_envs=min(num_envs, 3))
 
 
-@pytest.fixture
-def my_family(monkeypatch):
-    module = types.ModuleType("my_family")
-    module.make_small = make_small
-    monkeypatch.setattr(make_small, "__module__", "my_family")
-    monkeypatch.setitem(sys.modules, "my_family", module)
+SMALL = f"{__name__}.make_small"
 
 
 @pytest.mark.parametrize("name", ["SafeHopperVelocity-v0", "SafetyHopperVelocity-v1"])
@@ -43,19 +35,19 @@ def test_ids_of_the_velocity_family_are_names_too(name):
     assert make_env(name).config.robot == "hopper"
 
 
-def test_what_is_stored_is_made_by_its_name(my_family):
+def test_what_is_stored_is_made_by_its_name():
     store_config("Crowded", {"robot_base": "point", "hazards_num": 11})
     assert make_env("Crowded", num_envs=4 / 2, seed=0).config.hazards_num == 11
     keys = {"id": "Walk-v0", "cost_keys": ["fast"], "num_steps": 4}
     store_config("Stroll", {"_target_": "safe_rl.envs.gymnasium.make_gymnasium", **keys})
     assert make_env("Stroll", num_envs=2, seed=0).max_episode_steps == 4
-    store_config("Slow", {"_target_": "my_family.make_small", "velocity_threshold": 0.125})
+    store_config("Slow", {"_target_": SMALL, "velocity_threshold": 0.125})
     assert make_env("Slow", num_envs=2, seed=0).config.velocity_threshold == 0.125
 
 
-def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does(my_family):
-    node = {"_target_": "my_family.make_small", "name": "mine"}
-    with pytest.raises(TargetError, match=r"env\._target_=my_family.*import=my_family"):
+def test_a_family_of_ones_own_is_made_once_its_module_is_trusted_as_storing_does():
+    node = {"_target_": SMALL, "name": "mine"}
+    with pytest.raises(TargetError, match=rf"env\._target_={SMALL}.*import={__name__}"):
         make_env(node)
     store_config("Slow", node)
     assert make_env(node, num_envs=3).batch_size == (3,)

@@ -7,20 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 from commands import ROOT, SMALL, in_a_process, status_of
-from hydra import compose, initialize_config_dir
-from hydra.errors import ConfigCompositionException
-from omegaconf import OmegaConf
 from registrations import POINT, disc, register_mines
-from run_configs import CONF
 
 from safe_rl.cli.evaluate import main as evaluate
 from safe_rl.envs import (
     ConfigError,
     SafetyGymConfig,
     SafetyGymEnv,
-    make_env,
-    store_config,
-    store_configs,
 )
 from safe_rl.envs.extending import (
     Cost,
@@ -53,23 +46,6 @@ def test_registered_keys_are_keys_like_the_others():
     assert hash(before) == hash(SafetyGymConfig(robot_base="point"))
     assert before != SafetyGymConfig(robot_base="point", mines_num=1)
     assert before.replace(mines_num=1).mines_num == 1
-
-
-def compose_env(*overrides: str):
-    store_configs()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", overrides=list(overrides)).env
-
-
-def test_hydra_knows_registered_keys_and_configurations():
-    register_mines()
-    store_config("PointMines", {**POINT, "mines_num": 2})
-    node = compose_env("env=PointMines", "env.mines_num=4")
-    assert (node.name, node.mines_num, node.mines_cost) == ("PointMines", 4, 2.5)
-    env = make_env(OmegaConf.to_container(node, resolve=True), num_envs=2)
-    assert len(env.object_names) == 4
-    with pytest.raises(ConfigCompositionException, match=r"mine_num"):
-        compose_env("env=PointMines", "env.mine_num=4")
 
 
 def cost(magnitude, **others):

@@ -8,7 +8,7 @@ import torch
 from torchrl.envs import ConditionalSkip, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from safe_rl.envs import SUITE, SafetyGymEnv, env_node, from_gymnasium, make_env, resolve
+from safe_rl.envs import SafetyGymEnv, env_node, from_gymnasium, make_env, resolve
 from safe_rl.envs.transforms import ObservedCosts, Saute
 from safe_rl.envs.velocity import VELOCITY_SUITE
 
@@ -86,10 +86,6 @@ def dictionary(robot: str, level: str) -> dict:
 
 
 NAMES = list(itertools.product(ROBOTS, LEVELS))
-
-
-def test_the_suite_has_its_27_names():
-    assert sorted(SUITE) == sorted(map("".join, NAMES))
 
 
 @pytest.mark.parametrize(("robot", "level"), NAMES)

@@ -92,17 +92,14 @@ def test_rows_that_cannot_be_stepped_at_once_are_stepped_apart(trusted):
 
 def test_rows_end_and_begin_apart():
     env = make_env(PENDULUM | {"num_steps": 8}, num_envs=3, seed=0)
-    state = env.reset()
-    state["episode_step"] = torch.tensor([[0], [6], [3]])
-    ended = []
-    for _ in range(8):
-        state["action"] = torch.zeros(3, 1)
-        step, state = env.step_and_maybe_reset(state)
-        done = step["next", "done"].squeeze(-1)
-        same = (state["th"] == step["next", "th"]) & (state["thdot"] == step["next", "thdot"])
-        assert (same == ~done).all()
-        ended.append(done.tolist())
-    assert [[row[i] for row in ended].index(True) for i in range(3)] == [7, 1, 4]
+    start = env.reset()
+    start["episode_step"] = torch.tensor([[0], [6], [3]])
+    keys = {"auto_reset": False, "tensordict": start, "break_when_any_done": False}
+    steps = env.rollout(9, lambda td: td.set("action", torch.zeros(3, 1)), **keys)
+    ends = steps["next", "done"].squeeze(-1)
+    assert [row.nonzero()[0].item() for row in ends] == [7, 1, 4]
+    same = [steps[key][:, 1:] == steps["next", key][:, :-1] for key in ("th", "thdot")]
+    assert ((same[0] & same[1]) == ~ends[:, :-1]).all()
 
 
 def test_costs_may_be_entries_ranges_and_functions_at_once(trusted):

@@ -71,9 +71,10 @@ def test_a_robot_without_a_camera_is_an_error(tmp_path):
         SafetyGymEnv({"robot_base": str(blind), "observe_vision": True})
 
 
-def test_every_environment_has_a_variant_with_vision():
-    tasks = ("Run", "Run1", "Circle", "Circle1", "Circle2")
-    known = [*SUITE, *(robot + task for robot in ("Point", "Car", "Doggo") for task in tasks)]
+def test_every_environment_has_its_name_and_a_variant_with_vision():
+    tasks = [f"{task}{level}" for task in ("Goal", "Button", "Push") for level in "012"]
+    tasks += ["Run", "Run1", "Circle", "Circle1", "Circle2"]
+    known = [robot + task for robot in ("Point", "Car", "Doggo") for task in tasks]
     assert sorted([*SUITE, *EXTRAS]) == sorted([*known, *(f"{name}Vision" for name in known)])
     for name in known:
         config = resolve(f"Safexp-{name}Vision-v0")
