@@ -28,6 +28,7 @@ FAMILIES = {
     "velocity": ("SafeHumanoidVelocity-v0", {"env": "SafeHumanoidVelocity"}, 0.3),
     "safety gym": ("Safexp-PointGoal1-v0", {"env": "PointGoal1", "env.num_steps": 200}, 0.6),
 }
+SMALL = {"num_envs": 2, "frames_per_batch": 40, "frames": 40, "logger": "none", "algo": "ppo"}
 
 
 def write_episodes(path, name, action, episodes=12, steps=200):
@@ -80,7 +81,6 @@ def test_a_clone_does_in_the_raw_environment_what_the_file_says(family, tmp_path
 
 
 def learner(path, env, *overrides, name="PointGoal1"):
-    """A learner with a dataset in its replay buffer."""
     config = compose_config(
         *("algo=bc", f"env={name}", f"dataset.path={path}", "cost_limits={cost: 1e6}"),
         *("model.hidden_sizes=[8]", "memory.batch_size=4", *overrides),
@@ -89,7 +89,6 @@ def learner(path, env, *overrides, name="PointGoal1"):
 
 
 def learned(*given, **named):
-    """Steps of its replay buffer."""
     return torch.cat([*learner(*given, **named).replay_buffer.minibatches(20)])
 
 
@@ -132,43 +131,47 @@ def test_a_warning_names_actions_that_may_have_been_scaled():
         assert _smaller_actions(1.2 * actions, env) == ""
 
 
-def test_costs_and_ends_that_mean_something_else_are_refused(tmp_path):
-    path = tmp_path / "data.hdf5"
-    write_episodes(path, "Tank-v0", 1.0, episodes=2)
+def mark_ends(path, terminals, timeouts=()):
     with h5py.File(path, "a") as file:
-        file["terminals"][...] = file["timeouts"][:]
-    env = make_tank()
-    time_outs = "its episodes of 20 steps terminate, so these are time-outs"
-    with pytest.raises(ValueError, match=time_outs):
-        learned_actions(path, env)
-    write_episodes(path, "Tank-v0", 1.0, episodes=3)
-    with h5py.File(path, "a") as file:
-        ends = file["timeouts"][:]
-        ends[9] = True  # one ends early
-        file["terminals"][...], file["timeouts"][...] = ends, False
-    with pytest.raises(ValueError, match=time_outs):
-        learned_actions(path, env)
-    with h5py.File(path, "a") as file:
-        file["timeouts"][...] = ends & (np.arange(60) != 9)  # time-outs are marked as both
-    with pytest.raises(ValueError, match=time_outs):
-        learned_actions(path, env)
-    with h5py.File(path, "a") as file:
-        file["terminals"][...] = np.isin(np.arange(60), (19, 39))  # nor is the last one marked
-        file["timeouts"][...] = False
-    with pytest.raises(ValueError, match=time_outs):
-        learned_actions(path, env)
-    with h5py.File(path, "a") as file:
-        file["terminals"][...] = np.arange(60) == 9
+        file["terminals"][...] = np.isin(np.arange(60), terminals)
+        file["timeouts"][...] = np.isin(np.arange(60), timeouts)
+
+
+LAST = (19, 39, 59)  # steps of three episodes
+
+
+@pytest.mark.parametrize(
+    ("terminals", "timeouts"),
+    [
+        (LAST, LAST),
+        ((9, *LAST), ()),  # one ends early
+        ((9, *LAST), LAST),  # time-outs are marked as both
+        (LAST[:2], ()),  # nor is the last one marked
+    ],
+)
+def test_time_outs_that_a_file_calls_terminations_are_refused(terminals, timeouts, tmp_path):
+    write_episodes(tmp_path / "data.hdf5", "Tank-v0", 1.0, episodes=3)
+    mark_ends(tmp_path / "data.hdf5", terminals, timeouts)
+    with pytest.raises(ValueError, match="episodes of 20 steps terminate, so these are time-outs"):
+        learned_actions(tmp_path / "data.hdf5", make_tank())
+
+
+def test_a_file_that_lacks_the_ends_of_its_episodes_is_refused(tmp_path):
+    write_episodes(tmp_path / "data.hdf5", "Tank-v0", 1.0, episodes=3)
+    mark_ends(tmp_path / "data.hdf5", (9,))
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
         del file["next_observations"]
     with pytest.raises(ValueError, match=r"50 steps without an end, and episodes .* at most 20"):
-        learned_actions(path, env)
-    write_episodes(path, "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
-    env = make_env("PointGoal1", num_envs=1, seed=0)
-    for costs in (np.arange(8), np.array([0, 2] * 4)):  # summed over the episode, and over kinds
-        with h5py.File(path, "a") as file:
-            file["costs"][...] = costs
-        with pytest.raises(ValueError, match=rf"its cost is up to {costs.max()} in a step, that"):
-            learned(path, env)
+        learned_actions(tmp_path / "data.hdf5", make_tank())
+
+
+@pytest.mark.parametrize("costs", [[*range(8)], [0, 2] * 4], ids=["of episodes", "of kinds"])
+def test_costs_that_are_sums_are_refused(costs, tmp_path):
+    write_episodes(tmp_path / "data.hdf5", "Safexp-PointGoal1-v0", 0.5, episodes=1, steps=8)
+    with h5py.File(tmp_path / "data.hdf5", "a") as file:
+        file["costs"][...] = costs
+    with pytest.raises(ValueError, match=rf"its cost is up to {max(costs)} in a step, that"):
+        learned(tmp_path / "data.hdf5", make_env("PointGoal1", num_envs=1, seed=0))
 
 
 def test_recorded_actions_are_those_of_the_policy(tmp_path):
@@ -260,12 +263,9 @@ def test_the_order_of_safety_gymnasium(name, order):
 
 @pytest.mark.long
 def test_paths_may_have_any_characters(tmp_path):
-    """Umlauts, spaces, brackets and so on, as Python and the command take them in quotes."""
     folder = tmp_path / "Läufe [1] (ä, b)={c}"
-    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 40, "logger": "none"}
-    first = safe_rl.train("PointGoal1", algo="ppo", directory=folder, record=True, **small)
-    second = safe_rl.train("PointGoal1", algo="ppo", directory=tmp_path / "b", **small,
-                           init_from=folder)  # fmt: skip
+    first = safe_rl.train("PointGoal1", directory=folder, record=True, **SMALL)
+    second = safe_rl.train("PointGoal1", directory=tmp_path / "b", init_from=folder, **SMALL)
     assert second.table["steps"] == [40]
     env = make_env("PointGoal1", num_envs=2, seed=0)
     path = str(first.directory / "transitions").replace("'", "\\'")
@@ -287,25 +287,16 @@ def test_a_file_without_names_is_used_with_a_warning(tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("keys", "told"),
-    [
-        (
-            {"observe_vases": False, "observe_gremlins": True, "gremlins_num": 2},
-            "they have vases_lidar, where this environment has gremlins_lidar",
-        ),
-        (
-            {"lidar_type": "natural"},
-            "their lidar_type is pseudo, and that of this environment natural",
-        ),
-    ],
-)
-def test_a_policy_is_refused_where_other_sensors_have_its_size(keys, told, tmp_path):
-    small = {"num_envs": 2, "frames_per_batch": 40, "frames": 40, "logger": "none", "algo": "ppo"}
-    run = safe_rl.train("PointGoal1", directory=tmp_path / "first", **small)
-    with pytest.raises(CheckpointError, match=told):
-        run.evaluate(episodes=1, env=keys)
-    changed = {f"env.{key}": value for key, value in keys.items()}
-    with pytest.raises(CheckpointError, match=told):
-        safe_rl.train("PointGoal1", directory=tmp_path / "b", init_from=run.directory, **small,
-                      **changed)  # fmt: skip
+def test_a_policy_is_refused_where_other_sensors_have_its_size(tmp_path):
+    run = safe_rl.train("PointGoal1", directory=tmp_path / "first", **SMALL)
+    gremlins = {"observe_vases": False, "observe_gremlins": True, "gremlins_num": 2}
+    for keys, told in (
+        (gremlins, "they have vases_lidar, where this environment has gremlins_lidar"),
+        ({"lidar_type": "natural"}, "lidar_type is pseudo, and that of this environment natural"),
+    ):
+        changed = {f"env.{key}": value for key, value in keys.items()}
+        begun = SMALL | changed | {"directory": tmp_path / "b", "init_from": run.directory}
+        with pytest.raises(CheckpointError, match=told):
+            run.evaluate(episodes=1, env=keys)
+        with pytest.raises(CheckpointError, match=told):
+            safe_rl.train("PointGoal1", **begun)

@@ -1,4 +1,4 @@
-"""Minibatch updates against plain loops and closed forms."""
+"""Minibatch updates against plain loops and closed forms, and the sum that updates minimise."""
 
 import functools
 
@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import A2CLoss, ClipPPOLoss
 
+from safe_rl.algorithms.losses import divergence, sum_of_losses
 from safe_rl.algorithms.minibatch import KLAdaptiveRate, MinibatchUpdate
 from safe_rl.models import BehaviourPolicy, make_actor, make_critic
 from safe_rl.objectives import PPOLoss
@@ -115,18 +116,13 @@ def test_compiled_and_plain_updates_agree():
     torch.testing.assert_close(*(diagnostics for diagnostics, _ in results), atol=1e-4, rtol=1e-2)
 
 
-def test_gradients_are_clipped():
-    def distance(max_grad_norm):
-        loss = RecordingLoss()
-        sgd = functools.partial(torch.optim.SGD, lr=1.0)
-        MinibatchUpdate(
-            loss, optimizer=sgd, num_passes=1, minibatch_size=None, max_grad_norm=max_grad_norm
-        )(samples(20))
-        return loss.w.item()
-
-    # d/dw mean((w - x)²) at w = 0 is -2 mean(x) = -19
-    assert distance(None) == pytest.approx(19.0)
-    assert distance(0.5) == pytest.approx(0.5, abs=1e-5)
+# d/dw mean((w - x)²) at w = 0 is -2 mean(x) = -19
+@pytest.mark.parametrize(("max_grad_norm", "distance"), [(None, 19.0), (0.5, 0.5)])
+def test_gradients_are_clipped(max_grad_norm, distance):
+    loss, sgd = RecordingLoss(), functools.partial(torch.optim.SGD, lr=1.0)
+    settings = {"num_passes": 1, "minibatch_size": None, "max_grad_norm": max_grad_norm}
+    MinibatchUpdate(loss, optimizer=sgd, **settings)(samples(20))
+    assert loss.w.item() == pytest.approx(distance, abs=1e-5)
 
 
 def test_a_batch_beyond_the_limit_before_the_first_step_is_reported():
@@ -148,15 +144,11 @@ def test_a_batch_beyond_the_limit_before_the_first_step_is_reported():
 
 
 class Falling(RecordingLoss):
-    """Each step predicts a lower cost."""
-
     def forward(self, batch):
         return super().forward(batch).set("cost_surrogate", torch.tensor(1.0 - len(self.seen)))
 
 
 class Overflowing(RecordingLoss):
-    """Finite at first, infinite from the third call on."""
-
     def forward(self, batch):
         losses = super().forward(batch)
         if len(self.seen) > 2:
@@ -204,3 +196,41 @@ def test_an_update_that_ends_early_lowers_the_next_rate():
     assert nearly(samples(4, 5))["lr"] == pytest.approx(1e-2)
     with pytest.raises(ValueError, match="max_kl"):
         MinibatchUpdate(RecordingLoss(), **common)
+
+
+LOSSES = TensorDict(
+    loss_qvalue=torch.tensor(torch.inf),
+    loss_actor=torch.tensor(2.0),
+    cost_weight=torch.tensor([torch.nan, 1.0]),  # of two costs
+)
+
+
+def test_what_is_no_loss_is_neither_summed_nor_blamed():
+    assert sum_of_losses(LOSSES.clone().set("loss_qvalue", torch.tensor(0.5))) == 2.5
+    said = str(divergence(LOSSES))
+    assert said.startswith("'loss_qvalue' is inf: training has diverged.")
+    assert "cost_weight" not in said
+
+
+@pytest.mark.parametrize("shape", [(40, 1), (40,)])
+def test_a_loss_of_every_sample_is_named(shape):
+    """Alone it would be summed instead of averaged, beside others it cannot be stacked."""
+    losses = TensorDict(loss_more=torch.ones(shape))
+    for given in (losses, losses.clone().set("loss_objective", torch.tensor(1.0))):
+        with pytest.raises(ValueError, match=r"'loss_more' has shape \[40.*mean"):
+            sum_of_losses(given)
+    assert sum_of_losses(TensorDict(loss_a=torch.ones(1), loss_b=torch.tensor(2.0))) == 3
+
+
+def test_what_is_no_mapping_of_losses_is_told():
+    with pytest.raises(ValueError, match=r"a TensorDict with entries named 'loss_…', got .*Tensor"):
+        sum_of_losses(torch.tensor(1.0))
+    with pytest.raises(ValueError, match=r"an entry named 'loss_…'.*It returned \['objective'\]"):
+        sum_of_losses(TensorDict(objective=torch.tensor(1.0)))
+
+
+def test_a_sum_beyond_all_numbers_is_said_to_be_one():
+    huge = torch.tensor(3e38)
+    losses = TensorDict(loss_actor=huge, loss_qvalue=huge.clone())
+    assert sum_of_losses(losses).isinf()
+    assert str(divergence(losses)).startswith("The sum of the losses is not finite: training")

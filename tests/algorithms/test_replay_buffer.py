@@ -42,7 +42,6 @@ def make_batch(first, length, rows=2, ends=(), terminates=True):
 
 
 def all_of(memory):
-    """Transitions by observation."""
     drawn = torch.cat(list(memory.minibatches(40)))
     return {o: drawn[i] for i, o in enumerate(drawn["observation"].flatten().tolist())}
 
@@ -77,6 +76,22 @@ def test_the_oldest_go_first():
     assert sorted(all_of(memory)) == [4, 5, 6, 7, 8, 9]
 
 
+def assert_sums(found, ends, length, terminates=True):
+    """Those over three steps, or up to an end of an episode or of the rows."""
+    for observation, step in found.items():
+        time = int(observation % 1000)
+        last = min([time + 2, length - 1, *(end for end in ends if end >= time)])
+        assert step["steps_to_next_obs"] == last + 1 - time
+        assert step["next", "observation"] == observation + last + 1 - time
+        reward = sum(0.5 ** (then - time) * then for then in range(time, last + 1))
+        assert step["next", "reward"].item() == pytest.approx(reward)
+        cost = reward + 100 * sum(0.5**i for i in range(last + 1 - time))
+        assert step["next", "cost"].item() == pytest.approx(cost)
+        # what an end does to values is that of the transition's last step
+        assert step["next", "done"].item() is (last in {*ends, length - 1})
+        assert step["next", "terminated"].item() is (last in ends and terminates)
+
+
 @pytest.mark.parametrize("terminates", [True, False])
 def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates):
     memory = make_memory(n_steps=3)
@@ -84,19 +99,7 @@ def test_several_steps_are_summed_across_batches_and_not_across_ends(terminates)
         memory.extend(make_batch(first, 4, ends=[5], terminates=terminates))
     found = all_of(memory)
     assert sorted(found) == [row + time for row in (0, 1000) for time in range(9)]
-    for observation, step in found.items():
-        time = int(observation % 1000)
-        length = min(3, 6 - time) if time <= 5 else 3
-        assert step["steps_to_next_obs"] == length
-        assert step["next", "observation"] == observation + length
-        reward = sum(0.5**i * (time + i) for i in range(length))
-        assert step["next", "reward"].item() == pytest.approx(reward)
-        cost = reward + 100 * sum(0.5**i for i in range(length))
-        assert step["next", "cost"].item() == pytest.approx(cost)
-        # what an end does to values is that of the transition's last step
-        reaches_the_end = time <= 5 <= time + length - 1
-        assert step["next", "done"].item() is reaches_the_end
-        assert step["next", "terminated"].item() is (reaches_the_end and terminates)
+    assert_sums(found, [5], 12, terminates)
 
 
 @pytest.mark.parametrize(("length", "ends"), [(2, [1]), (8, [2, 7]), (8, [2])])
@@ -108,18 +111,10 @@ def test_rows_that_end_keep_no_step_back(length, ends):
     memory.extend(make_batch(50, 4))
     found = {o: step for o, step in all_of(memory).items() if o % 1000 < 50}
     assert sorted(found) == [row + time for row in (0, 1000) for time in range(length)]
-    for observation, step in found.items():
-        time = int(observation % 1000)
-        last = min([time + 2, length - 1, *(end for end in ends if end >= time)])
-        assert step["steps_to_next_obs"] == last + 1 - time
-        assert step["next", "observation"] == observation + last + 1 - time
-        reward = sum(0.5 ** (then - time) * then for then in range(time, last + 1))
-        assert step["next", "reward"].item() == pytest.approx(reward)
-        assert step["next", "terminated"].item() is (last in ends)
+    assert_sums(found, ends, length)
 
 
 def test_sums_do_not_go_on_in_other_trajectories():
-    """As in batches of asynchronous collectors."""
     memory, ended = make_memory(n_steps=3), make_memory(n_steps=3)
     # the trajectory changes within a batch, between two batches, and where no episode has ended
     for first, trajectories, is_last in (

@@ -1,17 +1,25 @@
-"""Updates from a memory: targets that follow, and checkpoints that lack nothing."""
+"""Updates from a memory: targets that follow, and checkpoints that lack nothing.
 
+Updates of any kind that are copied or stored, as processes and searches do, train their own
+networks.
+"""
+
+import pickle
 from copy import deepcopy
 from functools import partial
 
 import pytest
 import torch
+from samples import TRUST_REGION
 from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.objectives import ValueEstimators
 
-from safe_rl.algorithms import Memory, PolicyUpdate, ReplayUpdate
-from safe_rl.models import QEnsemble, make_bounded_actor, make_squashed_actor
-from safe_rl.objectives import BCLoss, SACLoss, TD3Loss
+from safe_rl.algorithms import Memory, MinibatchUpdate, PolicyUpdate, ReplayUpdate, TRPOStep
+from safe_rl.models import QEnsemble, make_actor, make_bounded_actor, make_squashed_actor
+from safe_rl.objectives import BCLoss, PPOLoss, SACLoss, TD3Loss, TRPOLoss
+
+ADAM = partial(torch.optim.Adam, lr=0.01)
 
 
 def make_update(seed, tau=0.1, **keys):
@@ -20,12 +28,9 @@ def make_update(seed, tau=0.1, **keys):
     loss = SACLoss(
         make_squashed_actor(3, spec.low, spec.high, hidden_sizes=[8]),
         QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
-        action_spec=spec,
-        gamma=0.9,
-        alpha_init=0.1,
+        **{"action_spec": spec, "gamma": 0.9, "alpha_init": 0.1},
     )
-    optimizer = partial(torch.optim.Adam, lr=0.01)
-    return ReplayUpdate(loss, optimizer=optimizer, updates_per_step=0.5, tau=tau, **keys)
+    return ReplayUpdate(loss, optimizer=ADAM, updates_per_step=0.5, tau=tau, **keys)
 
 
 def make_td3(device="cpu", kind=TD3Loss, gamma=0.9, **keys):
@@ -37,37 +42,28 @@ def make_td3(device="cpu", kind=TD3Loss, gamma=0.9, **keys):
         QEnsemble(3, 2, hidden_sizes=[8], num_networks=2),
         **{"action_spec": spec, "gamma": gamma, "policy_noise": 0.0, "noise_clip": 0.5},
     ).to(device)
-    adam = partial(torch.optim.Adam, lr=0.01)
-    return ReplayUpdate(loss, optimizer=adam, updates_per_step=1, tau=0.1, **keys)
-
-
-@pytest.fixture
-def memory():
-    return fill()
+    return ReplayUpdate(loss, optimizer=ADAM, updates_per_step=1, tau=0.1, **keys)
 
 
 def fill(**keys):
-    generator = torch.Generator().manual_seed(0)
+    draw = partial(torch.randn, 2, 40, generator=torch.Generator().manual_seed(0))
     memory = Memory(
         capacity=100, batch_size=16, in_keys=make_update(0).loss.in_keys, summed=["reward"],
         gamma=0.9, n_steps=1, keep=False, **keys,
     )  # fmt: skip
     flags = torch.zeros(2, 40, 1, dtype=torch.bool)
-    following = {"observation": torch.randn(2, 40, 3, generator=generator), "done": flags}
-    following |= {"terminated": flags, "reward": torch.randn(2, 40, 1, generator=generator)}
-    memory.extend(
-        TensorDict(
-            observation=torch.randn(2, 40, 3, generator=generator),
-            action=torch.rand(2, 40, 2, generator=generator),
-            next=following,
-            batch_size=[2, 40],
-        )
-    )
+    following = {"observation": draw(3), "done": flags, "terminated": flags, "reward": draw(1)}
+    here = {"observation": draw(3), "action": draw(2).tanh()}
+    memory.extend(TensorDict({**here, "next": following}, [2, 40]))
     return memory
 
 
+@pytest.fixture(name="memory")
+def filled():
+    return fill()
+
+
 def networks(update):
-    """Trained and target parameters of the Q functions, by name."""
     trained = update.loss.qvalue_network_params.flatten_keys(".")
     target = update.loss.target_qvalue_network_params.flatten_keys(".")
     return {name: (value.detach().clone(), target[name].clone()) for name, value in trained.items()}
@@ -114,11 +110,8 @@ def test_targets_that_would_never_move_and_other_losses_are_refused():
 def test_rates_are_those_of_the_longest_beginning_and_wrong_ones_are_told_the_nearest():
     rates = {"qvalue_network_params": 0.1, "qvalue_network_params.network.weights": 0.2}
     groups = make_update(0, rates=rates).optimizer.param_groups
-    assert [(group["lr"], len(group["params"])) for group in groups] == [
-        (0.01, 5),
-        (0.1, 2),
-        (0.2, 2),
-    ]
+    found = [(group["lr"], len(group["params"])) for group in groups]
+    assert found == [(0.01, 5), (0.1, 2), (0.2, 2)]
     with pytest.raises(ValueError, match=r"names 'alpha', but .* Did you mean 'log_alpha'"):
         make_update(0, rates={"alpha": 1e-4})
 
@@ -135,6 +128,69 @@ def test_constructors_are_checked_unless_an_annotation_cannot_be_read():
             return {}
 
     assert Own(None, size=3).size == 3
+
+
+CHANGES = {"copied": deepcopy, "stored": lambda x: pickle.loads(pickle.dumps(x))}
+
+
+def make_policy():
+    torch.manual_seed(0)
+    actor = make_actor(3, 2, hidden_sizes=[8], initial_log_std=-0.5)
+    with torch.no_grad():
+        batch = actor(TensorDict(observation=torch.randn(16, 3), batch_size=[16]))
+    return actor, batch.set("advantage", torch.randn(16, 1))
+
+
+def make_minibatch_update():
+    actor, batch = make_policy()
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.01)
+    update = MinibatchUpdate(loss, optimizer=ADAM, num_passes=3, minibatch_size=None)
+    return update, lambda update: update(batch.clone())
+
+
+def make_trpo_step():
+    actor, batch = make_policy()
+    step = TRPOStep(TRPOLoss(actor, entropy_coeff=0.01), **TRUST_REGION)
+    return step, lambda step: step(batch.clone())
+
+
+def make_replay_update():
+    def take(update):
+        torch.manual_seed(1)
+        update(fill(), 4)
+
+    return make_td3(), take
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("make", [make_minibatch_update, make_trpo_step, make_replay_update])
+def test_a_copy_trains_its_networks_and_no_others(make, change):
+    update, take = make()
+    take(update)  # so that an optimiser has moments
+    other = CHANGES[change](update)
+    before = TensorDict.from_module(update.loss).data.clone()
+    take(other)
+    assert (TensorDict.from_module(update.loss).data == before).all()
+    take(update)
+    after, copied = (TensorDict.from_module(part.loss).data for part in (update, other))
+    assert (after == copied).all()
+    changed = {key[0] for key, value in after.items(True, True) if (value != before[key]).any()}
+    expected = {"actor_network_params"}
+    if make is make_replay_update:
+        expected |= {"qvalue_network_params", "target_qvalue_network_params"}
+    assert expected <= changed
+    for key, tensor in TensorDict.from_module(other.loss.actor_network).data.items(True, True):
+        assert (tensor == copied["actor_network_params", *key]).all()
+
+
+def test_an_optimiser_that_is_copied_before_its_loss_trains_it():
+    actor, batch = make_policy()
+    loss = PPOLoss(actor, clip_epsilon=0.2, entropy_coeff=0.0)
+    optimizer, copied = deepcopy([ADAM(loss.parameters()), loss])
+    copied(batch)["loss_objective"].backward()
+    optimizer.step()
+    own, new = (TensorDict.from_module(part).data for part in (loss, copied))
+    assert any((new[key] != value).any() for key, value in own.items(True, True))
 
 
 @pytest.mark.gpu

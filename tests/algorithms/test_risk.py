@@ -7,13 +7,12 @@ import torch
 from point_mass_runs import point_mass_trainer, trainer_of
 from run_configs import off_policy_config, point_mass_config
 from scipy.optimize import minimize_scalar
-from scipy.stats import norm
 from tensordict import TensorDict
 
 from safe_rl.algorithms.constraints import Constraints
 from safe_rl.collectors import EpisodeAccounting
 from safe_rl.objectives import Chance, CVaR
-from safe_rl.objectives.risk import MeasuredCosts, RiskMeasure, cost_so_far
+from safe_rl.objectives.risk import MeasuredCosts, RiskMeasure
 from safe_rl.runs.table import read_table
 from safe_rl.trust import allow
 
@@ -62,22 +61,20 @@ def test_measured_costs_of_cvar_solve_the_program_of_rockafellar_and_uryasev(tai
 
 @pytest.mark.parametrize("kind", ["cvar", "chance"])
 def test_batches_that_cut_episodes_charge_the_same(kind):
+    """The accounting knows what open episodes have cost."""
     costs, ends = random_episodes()
     finished = totals_of(costs, ends)
-    before = torch.zeros(4, 2)
 
     def charge(steps):
         chance = Chance(torch.tensor([2.0, 3.0]), most_over=0.1)
         risk = cvar_of([2.0, 3.0]) if kind == "cvar" else chance
-        spent = cost_so_far(costs, ends, before)
-        parts = []
-        for start in range(0, 60, steps):
-            cut = slice(start, start + steps)
-            open_costs = before
-            if start:
-                closed = ends[:, start - 1].unsqueeze(-1)
-                open_costs = torch.where(closed, 0.0, spent[:, start - 1])
-            parts.append(risk(costs[:, cut], ends[:, cut], open_costs, finished).costs)
+        accounting, parts = EpisodeAccounting(4, ["a", "b"]), []
+        for cost, end in zip(costs.split(steps, 1), ends.split(steps, 1), strict=True):
+            following = {"a": cost[..., :1], "b": cost[..., 1:], "done": end.unsqueeze(-1)}
+            following["reward"] = torch.zeros_like(cost[..., :1])
+            episodes = accounting.update(TensorDict(next=following, batch_size=end.shape))
+            before = torch.stack([episodes.open_costs[key] for key in "ab"], -1).float()
+            parts.append(risk(cost, end, before, finished).costs)
         return torch.cat(parts, 1)
 
     # the same episodes are known to all of them, so that the value at risk is the same
@@ -110,50 +107,6 @@ def test_the_value_at_risk_is_that_of_the_last_episodes():
     assert measured.offset == 1
 
 
-def test_the_accounting_knows_what_open_episodes_have_cost():
-    costs, ends = random_episodes()
-    accounting = EpisodeAccounting(4, ["a", "b"])
-    spent = cost_so_far(costs, ends, torch.zeros(4, 2))
-    for start in range(0, 60, 12):
-        cut = slice(start, start + 12)
-        following = {
-            "a": costs[:, cut, :1], "b": costs[:, cut, 1:], "reward": torch.zeros(4, 12, 1),
-            "done": ends[:, cut].unsqueeze(-1),
-        }  # fmt: skip
-        episodes = accounting.update(TensorDict({"next": following}, batch_size=[4, 12]))
-        known = torch.stack([episodes.open_costs[key] for key in "ab"], -1)
-        expected = torch.zeros(4, 2)
-        if start:
-            expected = torch.where(ends[:, start - 1].unsqueeze(-1), 0.0, spent[:, start - 1])
-        torch.testing.assert_close(known.float(), expected, atol=1e-4, rtol=1e-4)
-
-
-def normal_episodes(episodes=40_000, steps=5):
-    """Costs N(3, 0.3²) of steps [E, T, 1], so that C is normal; ends; mean and deviation of C."""
-    costs = 3 + 0.3 * torch.randn(episodes, steps, 1)
-    ends = torch.zeros(episodes, steps, dtype=torch.bool)
-    ends[:, -1] = True
-    return costs, ends, 3.0 * steps, 0.3 * steps**0.5
-
-
-def test_the_cvar_of_normal_costs():
-    """CVaR = μ + σ φ(z) / α with z the (1 − α)-quantile."""
-    costs, ends, mean, deviation = normal_episodes()
-    measured = cvar_of([1.0], 0.25)(costs, ends, torch.zeros(len(costs), 1), costs.sum(1))
-    measure = measured.offset + measured.costs.sum() / len(costs)
-    expected = mean + deviation * norm.pdf(norm.ppf(0.75)) / 0.25
-    assert measure.item() == pytest.approx(expected, rel=1e-3)
-
-
-def test_the_chance_of_normal_costs():
-    costs, ends, mean, deviation = normal_episodes()
-    limit = mean + 0.5 * deviation
-    risk = Chance(torch.tensor([limit]), most_over=0.1)
-    measured = risk(costs, ends, torch.zeros(len(costs), 1), costs.sum(1))
-    share = measured.costs.sum().item() / len(costs) / limit
-    assert share == pytest.approx(1 - norm.cdf(0.5), abs=0.01)
-
-
 LIMITS = "cost_limits={cost_hazards: 2, cost_north: 1}"
 
 
@@ -162,7 +115,6 @@ LIMITS = "cost_limits={cost_hazards: 2, cost_north: 1}"
     [("ppo_lagrangian", "cvar"), ("cpo", "chance"), ("sac_lagrangian", "cvar")],
 )
 def test_every_algorithm_takes_it(tmp_path, algo, risk):
-    """What is compared with the limit is the measure."""
     words = [f"algo={algo}", f"risk={risk}", LIMITS, "frames=320", "limits.margin=0"]
     words += ["risk.tail=0.25", "limits.drift=null"] if risk == "cvar" else []
     if algo == "sac_lagrangian":
@@ -185,8 +137,6 @@ def test_every_algorithm_takes_it(tmp_path, algo, risk):
 
 
 class OfYourOwn(RiskMeasure):
-    """The mean cost, that asks for all that a measure can be given."""
-
     def __init__(self, cost_limits, *, max_length, steps_per_decision, share):
         self.limits, self.given = share * cost_limits, (max_length, steps_per_decision)
 

@@ -19,7 +19,6 @@ TABLE = {
 
 
 def drawn(cost_limits, table=TABLE):
-    """The panels of a picture."""
     return learning_curves(table, cost_limits, 1000, "title", "mean").axes
 
 

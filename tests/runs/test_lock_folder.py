@@ -8,7 +8,10 @@ import time
 
 import pytest
 from filelock import FileLock
+from omegaconf import OmegaConf
+from point_mass_runs import point_mass_trainer
 
+from safe_rl.evaluation import certifying
 from safe_rl.runs.folder import RunInUseError, lock_folder
 from safe_rl.runs.run import Run
 
@@ -30,7 +33,6 @@ def hold(folder, ready):
 
 @pytest.fixture
 def holder(folder):
-    """A process that holds the folder."""
     ready = FORK.Event()
     process = FORK.Process(target=hold, args=(folder, ready), daemon=True)
     process.start()
@@ -43,6 +45,17 @@ def holder(folder):
 def test_the_second_is_told_who_the_first_is(folder, holder):
     with pytest.raises(RunInUseError, match=rf"process {holder.pid} on .+\. Wait"):
         lock_folder(folder.lock_file).__enter__()
+
+
+def test_a_run_that_is_held_is_neither_trained_nor_certified(folder, holder, monkeypatch):
+    trainer = point_mass_trainer(folder.directory, "frames=160")
+    with pytest.raises(RunInUseError, match=f"process {holder.pid}"):
+        trainer.run()
+    assert not folder.has_begun
+    OmegaConf.save(trainer.writer.config, folder.config_file, resolve=True)
+    monkeypatch.setattr(certifying, "certify", lambda *_, **__: pytest.fail("without the lock"))
+    with pytest.raises(RunInUseError):
+        certifying.certify_run(folder.directory)
 
 
 def test_the_lock_dies_with_its_process(folder, holder):

@@ -19,35 +19,29 @@ from torchrl.checkpoint import CheckpointError
 from safe_rl.cli.sweeps import check_same_run
 from safe_rl.envs import SafetyGymEnv
 from safe_rl.runs.checkpoints import is_finished
-from safe_rl.runs.folder import RunInUseError
 from safe_rl.runs.run import Run
-from safe_rl.runs.table import read_table
 from safe_rl.training.building import build_trainer, seed_everything
 
 pytestmark = pytest.mark.long
 
 # episodes of 45 steps are open at the end of epochs of 30
 SMALL = [
+    *("env=PointGoal1", "algo=ppo_lagrangian", "env.num_steps=45", "frames=1800"),
     *("num_envs=4", "frames_per_batch=120", "model.hidden_sizes=[16]", "logger=none"),
     *("policy_update.minibatch_size=40", "policy_update.num_passes=2"),
     *("critic_update.minibatch_size=40", "critic_update.num_passes=2"),
 ]
-SAFETY_GYM = ["env.num_steps=45", "frames=1800"]
 
 
-def make_trainer(directory, *overrides, **options):
-    config = compose_config(*SMALL, *SAFETY_GYM, *overrides)
+def train(directory, *overrides):
+    """What the command line does: start, or continue what is there."""
+    config = compose_config(*SMALL, *overrides)
     seed_everything(config.seed, 1)
     env = SafetyGymEnv(
         {key: value for key, value in OmegaConf.to_container(config.env).items() if key != "name"},
-        num_envs=config.num_envs, seed=config.seed, num_threads=1, **options,
+        num_envs=config.num_envs, seed=config.seed, num_threads=1, sleep=True,
     )  # fmt: skip
-    return build_trainer(config, env, directory)
-
-
-def train(directory, *overrides, **options):
-    """What the command line does: start, or continue what is there."""
-    trainer = make_trainer(directory, *overrides, **options)
+    trainer = build_trainer(config, env, directory)
     if trainer.writer.run.has_begun:
         trainer.resume()
     trainer.run()
@@ -61,19 +55,20 @@ PATIENCE = 300
 """Seconds that nothing here takes, also on slow machines."""
 
 
-def in_a_process(directory, *overrides, kill_after=None, **options):
-    """Start a process of its own that trains; only such a one can be killed."""
+def exit_code_of_training(directory, *overrides, kill_after=None):
+    """That of a process of its own; only such a one can be killed."""
     process = SERVER.Process(
-        target=train_to_be_killed, args=(directory, overrides, kill_after, options), daemon=True
+        target=train_to_be_killed, args=(directory, overrides, kill_after), daemon=True
     )
     process.start()
-    return process
+    process.join(PATIENCE)
+    return process.exitcode
 
 
-def train_to_be_killed(directory, overrides, kill_after, options):
+def train_to_be_killed(directory, overrides, kill_after):
     if kill_after is not None:
         Thread(target=end_after_rows, args=(directory, kill_after), daemon=True).start()
-    train(directory, *overrides, **options)
+    train(directory, *overrides)
 
 
 def end_after_rows(directory, number):
@@ -87,22 +82,15 @@ def end_after_rows(directory, number):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def exit_code(process):
-    process.join(PATIENCE)
-    return process.exitcode
-
-
 def test_a_run_killed_several_times_leaves_the_table_of_one_that_was_not(tmp_path):
     """Kills of other algorithms and environments are in tests/attacks."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    overrides = ["env=PointGoal1", "algo=ppo_lagrangian"]
-    train(whole, *overrides, sleep=True)
+    train(whole)
     # one checkpoint per epoch, then one in several: what lies after it is done again
     for rows, interval in ((2, 0.0), (6, 0.2), (9, 0.4)):
         often = f"checkpoint.interval={interval}"
-        process = in_a_process(killed, *overrides, often, kill_after=rows, sleep=True)
-        assert exit_code(process) == -signal.SIGKILL
-    assert exit_code(in_a_process(killed, *overrides, sleep=True)) == 0
+        assert exit_code_of_training(killed, often, kill_after=rows) == -signal.SIGKILL
+    assert exit_code_of_training(killed) == 0
     table, expected = (without_times(folder / "progress.csv") for folder in (killed, whole))
     assert len(expected) == 1 + 15
     assert table == expected
@@ -157,27 +145,6 @@ def test_a_run_continued_with_what_cannot_train_keeps_its_configuration(tmp_path
     with pytest.raises(FloatingPointError):
         broken.run()
     assert (tmp_path / "config.yaml").read_text() == before
-    whole = point_mass_trainer(tmp_path, "frames=960")
-    whole.resume()
-    whole.run()
-    assert len(read_table(tmp_path / "progress.csv")["steps"]) == 6
-
-
-def test_a_second_process_does_not_touch_a_run_that_is_being_written(tmp_path):
-    process = in_a_process(tmp_path, "env=PointGoal1", "frames=100_000_000")
-    deadline = time.monotonic() + PATIENCE
-    while Run(tmp_path).num_rows < 2:
-        assert process.is_alive()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    with pytest.raises(RunInUseError, match=f"process {process.pid}"):
-        make_trainer(tmp_path, "env=PointGoal1").run()
-    assert process.is_alive()
-    process.kill()
-    assert exit_code(process) == -signal.SIGKILL
-    train(tmp_path, "env=PointGoal1", "frames=1200")
-    steps = read_table(tmp_path / "progress.csv")["steps"]
-    assert steps == [120.0 * (i + 1) for i in range(len(steps))]
 
 
 def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
@@ -195,16 +162,6 @@ def test_a_damaged_checkpoint_gives_way_to_the_older_one(tmp_path):
     trainer.run()
     tables = [without_times(tmp_path / name / "progress.csv") for name in ("run", "whole")]
     assert tables[0] == tables[1]
-
-
-def test_a_table_that_lacks_epochs_is_refused(tmp_path):
-    point_mass_trainer(tmp_path, "frames=640").run()
-    table = tmp_path / "progress.csv"
-    table.write_text("".join(table.read_text().splitlines(keepends=True)[:3]))
-    trainer = point_mass_trainer(tmp_path)
-    trainer.resume()
-    with pytest.raises(ValueError, match=r"holds 2 complete rows, but .* 4 epochs"):
-        trainer.run()
 
 
 def test_jobs_of_a_sweep_continue_with_the_same_settings_only(tmp_path):

@@ -67,14 +67,10 @@ def test_a_table_of_fewer_rows_than_are_to_be_kept_is_refused(tmp_path):
     assert read_table(path) == {"epoch": [1.0, 2.0]}
 
 
-def test_a_header_without_rows_gives_empty_columns(tmp_path):
+def test_a_row_that_is_cut_off_is_no_row(tmp_path):
     path = tmp_path / "progress.csv"
     path.write_text("epoch,steps\n")
     assert read_table(path) == {"epoch": [], "steps": []}
-
-
-def test_a_row_that_is_cut_off_is_no_row(tmp_path):
-    path = tmp_path / "progress.csv"
     for cut_off in ("2", "2,4", "2,40"):
         path.write_text(f"epoch,steps\n1,20\n{cut_off}")
         assert read_table(path) == {"epoch": [1.0], "steps": [20.0]}
@@ -118,27 +114,18 @@ def test_epochs_without_an_episode_have_no_feasible_return():
 
 
 def test_final_figures_leave_out_epochs_before_and_without_episodes():
-    epochs = 8
-    returns = [float(epoch) for epoch in range(epochs)]
-    returns[6] = math.nan
+    returns = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, math.nan, 7.0]
     table = {
-        "steps": [100.0 * (epoch + 1) for epoch in range(epochs)],
-        "time_total": [1.0 + epoch for epoch in range(epochs)],
+        "steps": [100.0 * (epoch + 1) for epoch in range(8)],
+        "time_total": [1.0 + epoch for epoch in range(8)],
         "episode_return": returns,
         "episode_cost": [10.0 * value for value in returns],
         "violation_cost": [10.0 * value - 25.0 for value in returns],
-        "cost_rate": [0.01 * epoch for epoch in range(epochs)],
+        "cost_rate": [0.01 * epoch for epoch in range(8)],
     }
-    final = final_figures(table, ["cost"])
     # epochs 2, 3, 4, 5 and 7, whose mean is 4.2
-    assert final == pytest.approx(
-        {
-            "episode_return": 4.2,
-            "episode_cost": 42.0,
-            "violation_cost": 17.0,
-            "cost_rate": 0.07,
-            "steps_per_second": 100.0,
-        }
-    )
+    expected = {"episode_return": 4.2, "episode_cost": 42.0, "violation_cost": 17.0}
+    expected |= {"cost_rate": 0.07, "steps_per_second": 100.0}
+    assert final_figures(table, ["cost"]) == pytest.approx(expected)
     line = outcome_line(table, {}, 50, "mean")
     assert line == "Return 4.20, cost 42.0 per episode, mean of steps 201 to 800; 100 steps/s"

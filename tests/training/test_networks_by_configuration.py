@@ -1,10 +1,12 @@
-"""Networks by configuration, from the command line: trained, resumed exactly, evaluated."""
+"""Networks and actions of other kinds, from the command line: trained, resumed, evaluated."""
 
 import json
+from functools import partial
 
-import gymnasium_envs  # noqa: F401, registers Recall-v0
+import gymnasium_envs  # noqa: F401, registers Recall-v0 and Boxes-v0
 import pytest
 import torch
+import yaml
 from commands import run_train
 from point_mass import PointMass  # noqa: F401
 from run_configs import compose_config, without_times
@@ -50,14 +52,8 @@ def test_workers_normalise_as_the_first_process_does(tmp_path):
         *("collector=process", "collector.num_collectors=1"),
     )
     seed_everything(0, 1)
-
-    def make(num_envs):
-        return make_env(
-            {"name": "PointGoal1", "robot_base": "point", "num_steps": 25},
-            num_envs=num_envs,
-            seed=0,
-        )
-
+    goal = {"name": "PointGoal1", "robot_base": "point", "num_steps": 25}
+    make = partial(make_env, goal, seed=0)
     trainer = build_trainer(config, make(num_envs=4), tmp_path, make)
     try:
         batches = iter(trainer.collector)
@@ -103,3 +99,41 @@ def test_workers_of_a_resumed_run_do_not_begin_with_its_first_episodes_again(tmp
     assert not (first == resumed).all(-1).any()
     for part in steps["next", "done"].squeeze(-1).split(40, dim=1):
         assert part.int().argmax(1).tolist() == [24, 18, 12, 6]
+
+
+CHOOSING = (  # environments whose actions are choices
+    *("env=gymnasium", "logger=none", "num_threads=1", "certificate.episodes=0", "num_envs=4"),
+    *("model.hidden_sizes=[8]", "frames_per_batch=200", "critic_update.minibatch_size=50"),
+)
+CART_POLE = ("env.id=CartPole-v1", "env.outside={cost_position: [0, -0.05, 0.05]}")
+
+
+def test_a_cart_learns_to_stay_within_a_range(tmp_path):
+    run_train(*CHOOSING, *CART_POLE, "algo=cpo", "frames=600", f"hydra.run.dir={tmp_path}")
+    env = yaml.safe_load((tmp_path / "config.yaml").read_text())["env"]
+    assert env["outside"] == {"cost_position": [0, -0.05, 0.05]}
+    table = read_table(tmp_path / "progress.csv")
+    pairs = zip(table["episode_cost_position"], table["episode_length"], strict=True)
+    assert all(0 < cost <= length for cost, length in pairs)
+    assert all(kl > 0 for kl in table["policy_kl"])
+    # a policy that begins with even odds has the entropy log 2
+    assert table["policy_entropy"][0] == pytest.approx(torch.tensor(2.0).log().item(), abs=0.05)
+    run_train(f"resume={tmp_path}", "frames=800")
+    assert read_table(tmp_path / "progress.csv")["steps"] == [200, 400, 600, 800]
+    options = ["episodes=4", "num_envs=2", "deterministic=true"]
+    assert evaluate.main([str(tmp_path), *options]) == 0
+    assert json.loads((tmp_path / "evaluation.json").read_text())["environment"] == "CartPole-v1"
+
+
+@pytest.mark.slow
+def test_several_choices_at_once_are_trained_in_processes_too(tmp_path):
+    """The environment itself refuses actions that it does not have."""
+    # imported by the workers, too, which would not know Boxes-v0
+    own = ("import=gymnasium_envs", "env.id=Boxes-v0", "cost_limits={cost: 6}", "frames=400")
+    own += ("policy_update.minibatch_size=50", "collector=process", f"hydra.run.dir={tmp_path}")
+    run_train(*CHOOSING, *own)
+    table = read_table(tmp_path / "progress.csv")
+    assert table["steps"] == [200, 400]
+    # what every step earns is at most 3, and costs at most 1.5; neither is ever all or nothing
+    assert all(0 < value < 30 for value in table["episode_return"])
+    assert all(0 < cost < 15 for cost in table["episode_cost"])

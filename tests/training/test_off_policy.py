@@ -29,6 +29,12 @@ def make_trainer(tmp_path):
     return lambda name, *words: trainer_of(off_policy_config(*words), tmp_path / name)
 
 
+def finished(trainer):
+    """The table of a run, at its end."""
+    trainer.run()
+    return read_table(trainer.writer.run.table_file)
+
+
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -47,7 +53,7 @@ def test_it_resumes_with_its_replay_buffer_as_if_it_had_never_stopped(
     assert resumed.algorithm.lost_on_resume == ""
 
 
-def test_without_its_replay_buffer_it_says_so_and_fills_a_new_one(make_trainer, tmp_path):
+def test_without_its_replay_buffer_it_says_so_and_fills_a_new_one(make_trainer):
     forgetful = ["algo=sac_lagrangian", "memory.keep=false"]
     make_trainer("run", *forgetful, "frames=640", "exploration.random_steps=200").run()
     resumed = make_trainer("run", *forgetful, "exploration.random_steps=200")
@@ -56,8 +62,7 @@ def test_without_its_replay_buffer_it_says_so_and_fills_a_new_one(make_trainer, 
     assert "200" in resumed.algorithm.lost_on_resume
     # it acts as it has learned at once, but learns when there is enough to learn from
     assert not resumed.algorithm.policy.is_random
-    resumed.run()
-    table = read_table(tmp_path / "run" / "progress.csv")
+    table = finished(resumed)
     assert table["policy_num_updates"] == [0, 8, 8, 8, 0, 8, 8, 8]
     learned = [not math.isnan(loss) for loss in table["policy_loss_qvalue"]]
     assert learned == [False, True, True, True, False, True, True, True]
@@ -80,40 +85,34 @@ def test_a_run_that_ends_before_it_learns_says_so(make_trainer):
     for steps, nothing in ((1, False), (3, True)):  # the last steps wait for their n-step returns
         trainer = make_trainer(f"equal{steps}", *equal, f"memory.n_steps={steps}")
         assert bool(trainer.algorithm.learns_from) == nothing
-        trainer.run()
-        table = read_table(trainer.writer.run.table_file)
-        assert (table["policy_num_updates"][-1] == 0) == nothing
+        assert (finished(trainer)["policy_num_updates"][-1] == 0) == nothing
 
 
-def test_the_update_to_data_ratio_holds_for_fractions(make_trainer, tmp_path):
-    make_trainer("run", "algo=sac", "policy_update.updates_per_step=0.021").run()
-    table = read_table(tmp_path / "run" / "progress.csv")
+def test_the_update_to_data_ratio_holds_for_fractions(make_trainer):
+    table = finished(make_trainer("run", "algo=sac", "policy_update.updates_per_step=0.021"))
     # 3.36 of an epoch: the first one's are due as well, the replay buffer being full enough
     assert sum(table["policy_num_updates"]) == int(8 * 160 * 0.021) == 26
     assert set(table["policy_num_updates"]) == {3, 4}
 
 
 def test_a_delayed_policy_moves_every_other_step(make_trainer):
-    trainer = make_trainer("run", "algo=td3", "policy_update.policy_delay=10000")
-    batches = iter(trainer.collector)
-    before = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
-    trainer.epoch(batches)
-    first = [p.detach().clone() for p in trainer.algorithm.networks["actor"].parameters()]
-    q = [p.detach().clone() for p in trainer.algorithm.networks["critic"].parameters()]
-    trainer.epoch(batches)
-    later = trainer.algorithm.networks["actor"].parameters()
-    assert any(not torch.equal(a, b) for a, b in zip(before, first, strict=True))
-    assert all(torch.equal(a, b) for a, b in zip(first, later, strict=True))
-    moved = trainer.algorithm.networks["critic"].parameters()
-    assert all(not torch.equal(a, b) for a, b in zip(q, moved, strict=True))
+    trainer, seen = make_trainer("run", "algo=td3", "policy_update.policy_delay=10000"), []
+    batches, networks = iter(trainer.collector), trainer.algorithm.networks
+    for _ in range(2):
+        seen.append({n: [p.detach().clone() for p in networks[n].parameters()] for n in networks})
+        trainer.epoch(batches)
+    first, later = seen[1], {name: list(network.parameters()) for name, network in networks.items()}
+    assert any(
+        not torch.equal(*pair) for pair in zip(seen[0]["actor"], first["actor"], strict=True)
+    )
+    assert all(map(torch.equal, first["actor"], later["actor"]))
+    assert not any(map(torch.equal, first["critic"], later["critic"]))
 
 
-def test_multipliers_go_by_the_costs_of_episodes(make_trainer, tmp_path):
+def test_multipliers_go_by_the_costs_of_episodes(make_trainer):
     """Not by what the critics say, which are trained on discounted costs."""
     keys = ["lagrangian=projected", "limits=null", "cost_limits={cost: 2}"]
-    make_trainer("run", "algo=sac_lagrangian", *keys).run()
-    table = read_table(tmp_path / "run" / "progress.csv")
-    penalty = 0.0
+    table, penalty = finished(make_trainer("run", "algo=sac_lagrangian", *keys)), 0.0
     for cost, found in zip(table["episode_cost"], table["multiplier_cost"], strict=True):
         penalty = min(max(penalty + 0.01 * (cost - 2.0), 0.0), 2.0)
         assert found == pytest.approx(penalty, abs=1e-5)
@@ -159,8 +158,6 @@ def test_another_run_starts_from_its_networks(make_trainer, tmp_path):
 
 
 class ToldOfCosts(SACLagrangianLoss):
-    """A loss of one's own that reads limits, and the state of the limits."""
-
     def __init__(self, *networks, cost_limits, **settings):
         super().__init__(*networks, **settings)
         self.limits = dict(cost_limits)
@@ -207,8 +204,7 @@ def test_it_is_evaluated_in_between_without_noise_and_without_consequences(tmp_p
                 cost_keys=["cost"], interval=interval, episodes=6, seed=5, fixed_layout=False,
             )  # fmt: skip
         trainer = trainer_of(config, tmp_path / name, make_evaluation=evaluation)
-        trainer.run()
-        return trainer, read_table(tmp_path / name / "progress.csv")
+        return trainer, finished(trainer)
 
     trainer, evaluated = train("evaluated", interval=400)
     _, plain = train("plain")
@@ -272,8 +268,7 @@ def test_it_learns_to_go_around_a_hazard(algo, words, tmp_path):
         *("model.hidden_sizes=[64, 64]", "memory.batch_size=128"),
         *words,
     )
-    trainer_of(config, tmp_path).run()
-    table = read_table(tmp_path / "progress.csv")
+    table = finished(trainer_of(config, tmp_path))
     # λ of the deterministic policy swings afterwards, on some processors more than on others
     returns, costs = (
         torch.tensor(table[name]).unfold(0, 20, 1).mean(1)

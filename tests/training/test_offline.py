@@ -36,7 +36,6 @@ def head_south(observation):
 
 
 def record(folder, *policies, num_steps=20, batches=2):
-    """Episodes of policies one after the other, as runs record them."""
     recording, number = Recording(folder, PointMass.cost_keys, PointMass().interface), 0
     for policy in policies:
         env = PointMass(4, num_steps)
@@ -58,7 +57,6 @@ def offline_config(folder, *overrides, algo="bc", limits="{cost: 1}"):
 
 
 def recorded_config(*overrides):
-    """Of a run that writes what it collects."""
     return compose_config(
         *("env=PointMass", "logger=none", "record=true", "num_envs=4", "frames_per_batch=160"),
         *("model.hidden_sizes=[16]", "algo=ppo", *overrides),
@@ -153,12 +151,7 @@ def test_a_resumed_run_records_again_what_it_repeats(tmp_path):
     # of a process that was killed before it could write a checkpoint, and was to be a longer run
     ahead = tmp_path / "halves" / "transitions"
     for number in (1, 2, 3):
-        Recording(ahead, []).write(number, TensorDict(
-            observation=torch.zeros(4, 1), action=torch.zeros(4, 1), batch_size=[4, 1],
-            next={key: torch.zeros(4, 1, 1) for key in (
-                "observation", "reward", "done", "terminated", "truncated",
-            )},
-        ))  # fmt: skip
+        Recording(ahead, []).write(number, PointMass(4).rollout(1))
     resumed = trainer_of(recorded_config("frames=480"), tmp_path / "halves")
     assert resumed.resume()
     resumed.run()
@@ -191,8 +184,6 @@ def test_whole_episodes_of_a_recording_are_those_of_the_table(kind, staggered, t
 
 
 def test_recording_may_begin_within_episodes(tmp_path):
-    """Of a resumed run that was not recorded until then."""
-
     def build(frames, record):
         keys = [f"frames={frames}", f"record={record}", "frames_per_batch=200"]
         return trainer_of(recorded_config(*keys, "staggered_starts=null"), tmp_path)
@@ -237,21 +228,12 @@ def test_the_loss_is_the_mean_squared_difference():
     assert loss.item() == pytest.approx(expected, rel=1e-6)
     loss.backward()
     assert all(p.grad is not None for p in actor.parameters())
-    with pytest.raises(KeyError, match="action"):
-        BCLoss(actor)(steps.exclude("action"))
     moved = BCLoss(actor)
     moved.set_keys(action=("expert", "action"))
     steps["expert", "action"] = steps.pop("action")
     torch.testing.assert_close(moved(steps)["loss_actor"], loss)
     with pytest.raises(ValueError, match=r"deterministic.*, not \['loc', 'scale'"):
         BCLoss(make_squashed_actor(3, -torch.ones(2), torch.ones(2), hidden_sizes=[8]))
-
-
-def test_a_dataset_from_which_nothing_would_ever_be_learned_is_refused(tmp_path):
-    data = record(tmp_path / "data", head_south)
-    with pytest.raises(ValueError, match="the replay buffer holds 160 transitions") as error:
-        OffPolicy.from_config(offline_config(data, "memory.batch_size=512"), PointMass(4))
-    assert "a minibatch of 512 (memory.batch_size)" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -275,8 +257,6 @@ def test_wrong_numbers_are_refused(algo, key, value, tmp_path):
 
 
 class Other(PointMass):
-    """Of another kind: five numbers are observed, or a picture."""
-
     def __init__(self, *shape):
         super().__init__(2)
         self.observation_spec = Composite(observation=Unbounded((2, *shape)), shape=[2])
@@ -289,6 +269,7 @@ class Other(PointMass):
         (["dataset.path=/no/where"], PointMass, "/no/where: there is no such recording"),
         (["+limit=0"], PointMass, "of its 160 transitions 0 are taken in whole"),
         (["memory.capacity=80"], PointMass, "room for them: memory.capacity=80"),
+        (["memory.batch_size=512"], PointMass, r"holds 160 .*a minibatch of 512 \(memory.batch"),
         ([], partial(Other, 5), "its observations are 4 numbers, those of this environment 5"),
         (["model=cnn"], partial(Other, 40, 40, 3), "has vectors as observations, and this env"),
     ],
@@ -302,13 +283,11 @@ def test_what_does_not_fit_is_said(overrides, env, words, tmp_path):
 
 
 def test_costs_that_a_dataset_lacks_are_named(tmp_path):
-    folder = tmp_path / "data"
-    batch = PointMass(2, 20).rollout(20)
-    Recording(folder, ["cost"]).write(0, batch)
-    limits = "{cost_north: 3}"
-    with pytest.raises(ValueError, match="has no cost_north, which cost_limits names"):
-        OffPolicy.from_config(offline_config(folder, limits=limits), PointMass(2))
-    with pytest.raises(ValueError, match="has no cost_north, which is learned from"):
-        OffPolicy.from_config(
-            offline_config(folder, algo="sac_lagrangian", limits=limits), PointMass(2)
-        )
+    Recording(tmp_path / "data", ["cost"]).write(0, PointMass(2, 20).rollout(20))
+    for algo, why in (
+        ("bc", "which cost_limits names"),
+        ("sac_lagrangian", "which is learned from"),
+    ):
+        config = offline_config(tmp_path / "data", algo=algo, limits="{cost_north: 3}")
+        with pytest.raises(ValueError, match=f"has no cost_north, {why}"):
+            OffPolicy.from_config(config, PointMass(2))

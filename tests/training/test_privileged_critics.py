@@ -5,7 +5,7 @@ import torch
 from run_configs import compose_config, without_times
 
 import safe_rl
-from safe_rl.algorithms import OffPolicy, OnPolicy
+from safe_rl.algorithms.algorithm_contract import find_algorithm
 from safe_rl.collectors.recording import read_recording
 from safe_rl.envs import make_env
 from safe_rl.evaluation import certify
@@ -52,10 +52,16 @@ def make(*, known=True):
     return make_env("PointGoal2", num_envs=4, seed=0, num_threads=1, observe_privileged=known)
 
 
-@pytest.mark.parametrize(("kind", "algo"), [(OffPolicy, "sac_lagrangian"), (OnPolicy, "cpo")])
-def test_critics_read_it_and_the_policy_does_not(kind, algo):
+def algorithm_of(algo, env, *more, **model):
+    config = compose_config("env=PointGoal2", *words(f"algo={algo}", *more))
+    config.model.update(model)
+    return find_algorithm(config).from_config(config, env)
+
+
+@pytest.mark.parametrize("algo", ["sac_lagrangian", "cpo"])
+def test_critics_read_it_and_the_policy_does_not(algo):
     env = make()
-    algorithm = kind.from_config(compose_config("env=PointGoal2", *words(f"algo={algo}")), env)
+    algorithm = algorithm_of(algo, env)
     step = env.rollout(1)[:, 0]
     other = step.clone().set("privileged", step["privileged"] + 1)
     assert algorithm.policy.in_keys == ["observation"]
@@ -64,19 +70,15 @@ def test_critics_read_it_and_the_policy_does_not(kind, algo):
         before, after = (critic(x.clone()).get(critic.out_keys[0]) for x in (step, other))
         assert (before != after).any()
     # as before without the key, and with the default
-    for entry in ("[observation]", "null"):
-        config = compose_config("env=PointGoal2", *words(f"algo={algo}"))
-        config.model.critic_observes = None if entry == "null" else ["observation"]
-        critic = kind.from_config(config, env).networks["critic"]
+    for entry in (["observation"], None):
+        critic = algorithm_of(algo, env, critic_observes=entry).networks["critic"]
         assert "privileged" not in critic.in_keys
 
 
 @pytest.mark.parametrize("algo", ["sac_lagrangian", "cpo"])
 def test_an_environment_without_it_is_refused(algo):
-    config = compose_config("env=PointGoal2", *words(f"algo={algo}"))
-    kind = OffPolicy if algo == "sac_lagrangian" else OnPolicy
     with pytest.raises(ValueError, match=r"critic_observes.* Set env\.observe_privileged=true"):
-        kind.from_config(config, make(known=False))
+        algorithm_of(algo, make(known=False))
 
 
 @pytest.mark.long
@@ -85,12 +87,9 @@ def test_an_environment_without_it_is_refused(algo):
 )
 def test_runs_learn_resume_and_act_without_it(name, tmp_path):
     whole = train(tmp_path / "whole", name, **READ)
-    stop = lambda row: row["epoch"] < 2  # noqa: E731
-    train(tmp_path / "halves", name, **READ, callbacks=[stop])
+    train(tmp_path / "halves", name, **READ, callbacks=[lambda row: row["epoch"] < 2])
     safe_rl.resume(tmp_path / "halves")
-    table, expected = (
-        without_times(tmp_path / run / "progress.csv") for run in ("halves", "whole")
-    )
+    table, expected = (without_times(tmp_path / n / "progress.csv") for n in ("halves", "whole"))
     assert len(table) == len(expected) == 4
     if name != "workers":  # whose environments begin new episodes in a resumed run
         assert table == expected
@@ -111,8 +110,7 @@ def test_the_entry_alone_changes_nothing(tmp_path):
 
 def test_its_columns_are_normalised():
     env = make()
-    config = compose_config("env=PointGoal2", *words("algo=ppo", "model.normalise=10"))
-    algorithm, batch = OnPolicy.from_config(config, env), env.rollout(5)
+    algorithm, batch = algorithm_of("ppo", env, "model.normalise=10"), env.rollout(5)
     update_running_scales(algorithm.networks.values(), batch)
     scales = [m for m in algorithm.critic.modules() if isinstance(m, RunningScale)]
     assert [scale.key for scale in scales] == ["observation", "privileged"]

@@ -21,22 +21,10 @@ from safe_rl.training.state import (
 )
 
 
-def signal_in(trainer, epoch, number):
-    """Let a signal come while an epoch is recorded."""
-    record = trainer.writer.add
-
-    def record_and_signal(row):
-        record(row)
-        if row["epoch"] == epoch:
-            signal.raise_signal(number)
-
-    trainer.writer.add = record_and_signal
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_run_after_the_epoch_with_a_checkpoint(tmp_path, number):
     trainer = point_mass_trainer(tmp_path, "frames=100_000_000")
-    signal_in(trainer, 3, number)
+    trainer.callbacks = [lambda row: signal.raise_signal(number) if row["epoch"] == 3 else None]
     before = signal.signal(number, signal.SIG_DFL)  # nohup ignores SIGHUP
     trainer.run()
     assert signal.signal(number, before) is signal.SIG_DFL

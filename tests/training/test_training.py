@@ -6,8 +6,9 @@ from statistics import fmean
 
 import pytest
 from point_mass_runs import point_mass_trainer
-from run_configs import assert_resumes_exactly, without_times
+from run_configs import assert_resumes_exactly
 
+import safe_rl
 from safe_rl.algorithms import PolicyUpdate
 from safe_rl.runs.checkpoints import CheckpointStore, read_facts, read_states
 from safe_rl.runs.folder import checkpoints_in
@@ -25,49 +26,29 @@ def train(directory, *overrides, **options):
     return trainer, read_table(directory / "progress.csv")
 
 
-LEARNING = [
-    "frames=40_000",
-    "num_envs=16",
-    "frames_per_batch=1600",
-    "policy_update.minibatch_size=400",
-    "policy_update.num_passes=10",
-    "policy_update.optimizer.lr=3e-3",
-    "critic_update.minibatch_size=400",
-    "critic_update.num_passes=10",
-    "critic_update.optimizer.lr=1e-2",
-]
-
-
 @pytest.mark.long
 def test_ppo_lagrangian_keeps_the_limits(tmp_path):
-    limits = {"cost_hazards": 1.0, "cost_north": 1.0}
-    _, table = train(
-        tmp_path,
-        *LEARNING,
-        "algo=ppo_lagrangian",
-        "cost_limits={cost_hazards: 1.0, cost_north: 1.0}",
-        "limits=null",
-        "loss.cost_clipping=none",
-        "lagrangian=adam",
-        "lagrangian.init=0.3",
-        "lagrangian.lr=0.15",
-    )
+    words = ["algo=ppo_lagrangian", "cost_limits={cost_hazards: 1.0, cost_north: 1.0}"]
+    words += ["frames=40_000", "num_envs=16", "frames_per_batch=1600", "limits=null"]
+    words += ["policy_update.num_passes=10", "policy_update.optimizer.lr=3e-3"]
+    words += ["critic_update.num_passes=10", "critic_update.optimizer.lr=1e-2"]
+    words += ["critic_update.minibatch_size=400", "loss.cost_clipping=none"]
+    words += ["lagrangian=adam", "lagrangian.init=0.3", "lagrangian.lr=0.15"]
+    _, table = train(tmp_path, *words, minibatch_size=400)
     assert table["episode_cost_hazards"][0] > 3.0
-    for key, limit in limits.items():
-        cost = sum(table[f"episode_{key}"][-5:]) / 5
-        assert cost < 1.25 * limit
+    for key in ("cost_hazards", "cost_north"):
+        assert fmean(table[f"episode_{key}"][-5:]) < 1.25
     assert table["episode_return"][-1] > 0.8
     assert len({*table["multiplier_cost_hazards"]} & {*table["multiplier_cost_north"]}) <= 1
 
 
-def test_the_same_seed_gives_the_same_table_but_for_times(tmp_path):
-    first, second = tmp_path / "first", tmp_path / "second"
-    _, table = train(first, "frames=200")
-    assert table["steps"] == [160, 320]  # whole batches
-    train(second, "frames=200")
-    assert without_times(first / "progress.csv") == without_times(second / "progress.csv")
-    train(tmp_path / "other", "frames=200", "seed=1")
-    assert without_times(first / "progress.csv") != without_times(tmp_path / "other/progress.csv")
+@pytest.mark.slow
+def test_ppo_lagrangian_keeps_a_limit_of_the_benchmark_and_still_reaches_goals(tmp_path):
+    """Four seeds came to returns of 10 to 13 and costs of 18 to 27 with a smaller margin."""
+    settings = {"frames": 1_000_000, "logger": "none", "directory": tmp_path}
+    run = safe_rl.train("PointGoal1", algo="ppo_lagrangian", **settings)
+    assert run.final["episode_return"] > 6
+    assert run.final["episode_cost"] < 30
 
 
 def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
@@ -80,7 +61,6 @@ def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
 
 
 def best_of(folder):
-    """Scores of the best checkpoints by name."""
     found = checkpoints_in(folder / "checkpoints/best")
     return {path.name: read_facts(path)["score"] for path in found}
 
@@ -125,15 +105,11 @@ def test_the_folder_of_a_run(tmp_path):
     words = ("frames=640", "checkpoint.interval=0", "cost_limits={cost: 1000}")
     trainer = point_mass_trainer(tmp_path, *words)
     line = trainer.run()
-    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
-    assert {"config.yaml", "progress.csv"} <= names
-    assert {name for name in names if name.startswith("checkpoints/last/")} == {
-        "checkpoints/last/checkpoint-000000000480.torchrl",
-        "checkpoints/last/checkpoint-000000000640.torchrl",
-    }
+    assert (tmp_path / "config.yaml").is_file()
+    last, best = (sorted((tmp_path / "checkpoints" / name).iterdir()) for name in ("last", "best"))
+    assert [p.name for p in last] == [f"checkpoint-000000000{n}.torchrl" for n in (480, 640)]
     table = read_table(tmp_path / "progress.csv")
-    path = max((tmp_path / "checkpoints" / "best").iterdir())
-    facts = read_facts(path)
+    facts = read_facts(best[-1])
     assert facts.pop("interface")["actions"]["low"] == [-1.0, -1.0]
     # the last policy is judged by the last three epochs
     assert facts == {
@@ -141,13 +117,10 @@ def test_the_folder_of_a_run(tmp_path):
         "run": {"environment": "PointMass", "algorithm": "ppo_lagrangian", "seed": 0},
     }
     # what acts, and not what only resuming needs
-    kept, last = (
-        set(read_states(file))
-        for file in (path, max((tmp_path / "checkpoints" / "last").iterdir()))
-    )
+    kept, whole = (set(read_states(files[-1])) for files in (best, last))
     assert {"actor", "critic", "cost_critic", "multiplier"} <= kept
-    assert last - kept >= {"policy_update", "critic_update", "env", "accounting", "rng"}
-    assert "losses" not in last  # those of the package remember nothing
+    assert whole - kept >= {"policy_update", "critic_update", "env", "accounting", "rng"}
+    assert "losses" not in whole  # those of the package remember nothing
     assert line.startswith("Return ")
     assert line.endswith(str(tmp_path))
 
@@ -167,55 +140,17 @@ def test_epochs_without_a_finished_episode(tmp_path, curves):
 
 
 class ReportingUpdate(PolicyUpdate):
-    """A policy update of one's own: changes nothing, reports what it was given."""
-
     def __init__(self, loss):
         self.loss = loss
 
     def __call__(self, batch, limits):
         return {"violation": limits.required_decrease, "length": limits.length}
 
-    def state_dict(self):
-        return {}
-
-    def load_state_dict(self, state_dict):
-        pass
-
-
-OWN_UPDATE = """
-# @package _global_
-algo: {name: mine, constrained: true}
-loss: {_target_: safe_rl.objectives.PPOLoss, clip_epsilon: 0.2, entropy_coeff: 0.0}
-policy_update: {_target_: test_training.ReportingUpdate}
-advantage:
-  {_target_: safe_rl.objectives.VectorGAE, gamma: 0.99, lmbda: 0.95, value_target: return_to_go}
-cost_advantage:
-  {_target_: safe_rl.objectives.CostGAE, gamma: 0.99, lmbda: 0.9, value_target: return_to_go}
-critic_update:
-  _target_: safe_rl.algorithms.MinibatchUpdate
-  optimizer: {_target_: torch.optim.Adam, _partial_: true, lr: 1.0e-3}
-  num_passes: 10
-  minibatch_size: 40
-model: {hidden_sizes: [16], initial_log_std: -0.5, input_scale: {}, head: auto, normalise: null}
-frames: 1280
-num_envs: 4
-frames_per_batch: 160
-staggered_starts: null
-"""
-
-
-def own_algorithm(folder, text=OWN_UPDATE):
-    """Overrides that find ``algo=mine`` in a folder outside the repository."""
-    allow(__name__)
-    (folder / "algo").mkdir()
-    (folder / "algo" / "mine.yaml").write_text(text)
-    return [f"hydra.searchpath=[file://{folder}]", "algo=mine"]
-
 
 def train_own_update(folder, limits, num_steps):
-    """The table of a run whose update reports what it is given."""
-    words = (*own_algorithm(folder), limits, "staggered_starts=null", "frames=640")
-    return train(folder / "run", *words, num_steps=num_steps, minibatch_size=None)[1]
+    own = ("algo=cpo", "~policy_update", f"+policy_update={{_target_: {__name__}.ReportingUpdate}}")
+    words = (*own, limits, "limits=null", "staggered_starts=null", "frames=640")
+    return train(folder, *words, num_steps=num_steps, minibatch_size=None)[1]
 
 
 def test_a_policy_update_from_outside_the_package(tmp_path):
@@ -232,9 +167,9 @@ def test_a_policy_update_from_outside_the_package(tmp_path):
 
 
 def test_a_loss_without_its_multiplier_is_refused_when_it_is_built(tmp_path):
-    own = own_algorithm(tmp_path, OWN_UPDATE.replace("PPOLoss", "PPOLagrangianLoss"))
+    lagrangian = "loss._target_=safe_rl.objectives.PPOLagrangianLoss"
     with pytest.raises(ValueError, match=r"^loss: .*missing 1 required .*'multiplier'"):
-        point_mass_trainer(tmp_path / "run", *own, minibatch_size=None)
+        point_mass_trainer(tmp_path, "algo=ppo", lagrangian)
 
 
 def test_batches_of_whole_episodes_are_judged_by_those(tmp_path):

@@ -1,4 +1,4 @@
-"""Policy and critics learn at the same time what they learn one after the other."""
+"""What updates ask of the processor: kernels that suit it, and two updates at the same time."""
 
 import threading
 
@@ -7,17 +7,94 @@ import torch
 from point_mass_runs import point_mass_trainer
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
-from safe_rl.algorithms import on_policy
-from safe_rl.algorithms.processor_use import in_parallel, torch_threads
+from safe_rl.algorithms import on_policy, processor_use
+from safe_rl.algorithms.processor_use import (
+    fast_products,
+    in_parallel,
+    prefers_onednn,
+    torch_threads,
+)
+from safe_rl.models.networks import cpuinfo
 from safe_rl.objectives import PPOLoss
 from safe_rl.trust import allow
 
 allow(__name__)
+ZEN = "vendor_id : AuthenticAMD\nmodel name : AMD EPYC\nflags : fpu avx2 avx512f avx512_bf16\n"
+
+
+@pytest.fixture
+def of_use(monkeypatch):
+    monkeypatch.setattr(processor_use, "prefers_onednn", lambda cpuinfo: True)
+    products = torch.backends.mkldnn.matmul
+    before = products.fp32_precision
+    yield products
+    products.fp32_precision = before
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (ZEN, True),
+        (ZEN.replace("AuthenticAMD", "GenuineIntel"), False),
+        (ZEN.replace(" avx512f", ""), False),
+        (ZEN.replace("avx512_bf16", "amx_tile"), False),
+        ("CPU implementer : 0x41\nFeatures : fp asimd bf16", False),
+        ("", False),
+    ],
+)
+def test_only_where_it_is_faster_and_rounds_nothing(text, expected):
+    assert prefers_onednn(text) is expected
+
+
+@pytest.mark.skipif(not prefers_onednn(cpuinfo()), reason="a processor that MKL serves well")
+def test_products_are_those_of_single_precision():
+    rows, inner, columns = 4000, 60, 64
+    generator = torch.Generator().manual_seed(0)
+    left = torch.randn(rows, inner, generator=generator)
+    right = torch.randn(inner, columns, generator=generator)
+    exact = left.double() @ right.double()
+    with fast_products():
+        product = left @ right
+    rounded = left.bfloat16().double() @ right.bfloat16().double()
+    error = (product - exact).abs().mean()
+    assert error < 1e-5
+    assert (rounded - exact).abs().mean() > 1000 * error  # what would be lost by bfloat16
+
+
+def test_it_is_for_the_block_alone_also_if_that_fails(of_use):
+    before, seen = of_use.fp32_precision, []
+
+    def diverge():
+        with fast_products():
+            seen.append(of_use.fp32_precision)
+            raise FloatingPointError
+
+    with pytest.raises(FloatingPointError):
+        diverge()
+    assert (seen, of_use.fp32_precision) == (["bf16"], before)
+
+
+@pytest.mark.parametrize(("given", "is_available"), [("ieee", True), ("none", False)])
+def test_a_precision_of_the_users_is_kept_and_that_of_a_torch_without_it(
+    given, is_available, of_use, monkeypatch
+):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: is_available)
+    of_use.fp32_precision = given
+    with fast_products():
+        assert of_use.fp32_precision == given
+
+
+def test_training_has_it_for_updates_alone(of_use, tmp_path, monkeypatch):
+    trainer, seen = point_mass_trainer(tmp_path, "algo=ppo", "frames=160"), []
+    learn = trainer.algorithm.learn
+    watched = lambda *given: seen.append(of_use.fp32_precision) or learn(*given)  # noqa: E731
+    monkeypatch.setattr(trainer.algorithm, "learn", watched)
+    trainer.run()
+    assert seen == ["bf16"]
+    assert of_use.fp32_precision == "none"
 
 
 class WithCritic(PPOLoss):
-    """A loss of one's own that has the critic among its parameters."""
-
     def __init__(self, actor_network, critic_network, **settings):
         super().__init__(actor_network, **settings)
         self.critic = critic_network
@@ -86,8 +163,7 @@ def test_threads_are_shared_and_given_back(two_threads):
 
 @pytest.mark.parametrize("fails", [0, 1])
 def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
-    ended = threading.Event()
-    failed = threading.Event()
+    failed, ended = threading.Event(), threading.Event()
 
     def fail():
         failed.set()
@@ -97,10 +173,8 @@ def test_the_other_ends_before_an_error_is_raised(two_threads, fails):
         failed.wait(10)
         ended.set()
 
-    calls = [end, end]
-    calls[fails] = fail
     with pytest.raises(FloatingPointError, match="diverged"):
-        in_parallel(*calls)
+        in_parallel(*((end, fail) if fails else (fail, end)))
     assert ended.is_set()
     assert torch.get_num_threads() == 2
 
