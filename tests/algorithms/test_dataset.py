@@ -179,8 +179,7 @@ def test_recorded_actions_are_those_of_the_policy(tmp_path):
     env = make_tank()
     steps = env.rollout(20)
     steps["action"].fill_(-1.5)
-    Recording(tmp_path / "known", env.cost_keys, env.interface).write(0, steps)
-    assert learned_actions(tmp_path / "known", env) == [-1.0]
+    assert learned_actions(recorded(tmp_path / "known", env, steps), env) == [-1.0]
     steps["action"].fill_(0.25)  # of an environment whose policies act in its own units
     about = {"actions": {"low": [0.0], "high": [2.0], "own_low": [0.0], "own_high": [2.0]}}
     Recording(tmp_path / "other", env.cost_keys, about).write(0, steps)

@@ -48,7 +48,7 @@ def test_the_second_is_told_who_the_first_is(folder, holder):
 
 
 def test_a_run_that_is_held_is_neither_trained_nor_certified(folder, holder, monkeypatch):
-    trainer = point_mass_trainer(folder.directory, "frames=160")
+    trainer = point_mass_trainer(folder.directory, "frames=160", "certificate.episodes=0")
     with pytest.raises(RunInUseError, match=f"process {holder.pid}"):
         trainer.run()
     assert not folder.has_begun

@@ -88,16 +88,6 @@ def test_signals_are_left_alone_outside_the_main_thread():
     assert handlers[1] == handlers[0]
 
 
-def test_a_machine_without_accelerators_restores_the_generator_of_its_cpu(monkeypatch):
-    for kind in (torch.cuda, torch.xpu, torch.mps):
-        monkeypatch.setattr(kind, "device_count", lambda: 0)
-    state = RandomGenerators().state_dict()
-    drawn = torch.rand(3)
-    other = state["torch_cpu"]
-    RandomGenerators().load_state_dict({**state, "torch_cuda": [other] * 2, "torch_mps": other})
-    assert torch.equal(torch.rand(3), drawn)
-
-
 def test_counters_of_a_run_that_has_just_begun_are_restored():
     progress = Progress(3, 40, 5.0)
     progress.load_state_dict(Progress().state_dict())
