@@ -68,6 +68,7 @@ def test_the_budget_is_what_is_left_of_it_by_kind_and_row():
     budgets = {"cost": 4.0, "cost_north": 40.0}
     env = transformed(Priced(costs), saute=Saute(budgets, **SAUTE))
     assert env.observation_layout["budget"] == slice(4, 6)
+    assert env.observation_spec["observation"].shape == (2, 6)
     batch = still(env, 7)  # an episode of 5 steps and two of the next one
     shares = torch.tensor(costs).unsqueeze(-1) * torch.tensor([1 / 4, 2 / 40])
     before, after = [], []
@@ -196,6 +197,26 @@ def test_episodes_of_an_evaluation_are_whole_unless_they_are_to_end_too(in_evalu
     batch = still(transformed(Priced([[3.0] * 6]), end=end, evaluating=True), 6)["next"]
     assert batch["terminated"].squeeze().nonzero()[:, 0].tolist() == ends
     assert batch["done"].squeeze().nonzero()[:, 0].tolist() == (ends or [5])
+
+
+@pytest.mark.parametrize(
+    ("evaluating", "in_evaluation", "highest"),
+    [(False, False, 3.0), (True, False, 8.0), (True, True, 3.0)],
+)
+def test_no_episode_costs_more_than_the_budget_and_a_step_where_it_ends_by_it(
+    evaluating, in_evaluation, highest
+):
+    end = EarlyTermination({"cost": 2.0}, in_evaluation=in_evaluation)
+    assert transformed("safety_gym", evaluating=evaluating, end=end).highest_cost("cost") == highest
+
+
+def test_a_state_without_a_transform_begins_its_episode():
+    env = transformed(PointMass(2), "saute")
+    env.rollout(1)
+    state = env.get_state()
+    state["transforms", "saute", "budget"][:] = 0.25
+    assert (env.set_state(state)["observation"][:, -1] == 0.25).all()
+    assert (env.set_state(state.exclude("transforms"))["observation"][:, -1] == 1).all()
 
 
 def test_a_state_shares_no_memory_with_the_environment():
