@@ -109,9 +109,9 @@ def prepare(words: Sequence[str]) -> list[str]:
         ConfigStore.instance().store(RESUMED, read_resumed(directory, modules, [*words, *flags]))
         return [*words, *flags, f"--config-name={RESUMED}"]
     new = [] if modules is None else [*overrides_of({"import": modules})]
-    for name in slates:
+    if slates:
         from safe_rl.scores.benchmark import SLATES  # reads the published scores
-
+    for name in slates:
         if name not in SLATES:
             raise ValueError(
                 f"Unknown slate '{name}'.{did_you_mean(name, SLATES)} "

@@ -145,6 +145,19 @@ def test_a_loss_that_fails_in_the_search_leaves_the_parameters():
     assert torch.equal(flatten(actor.parameters()), before)
 
 
+def test_a_function_that_is_the_loss_is_lowered():
+    actor, batch = make_case(0)
+
+    def towards_zero(batch):
+        return TensorDict(loss_mean=actor.get_dist(batch.clone()).mean.square().mean())
+
+    start = towards_zero(batch)["loss_mean"]
+    step = TRPOStep(towards_zero, actor_network=actor, **SETTINGS)
+    for _ in range(30):
+        step(batch)
+    assert towards_zero(batch)["loss_mean"] < 0.1 * start
+
+
 @pytest.mark.parametrize(("violation", "case"), [(-1e4, 3), (-5.0, 2), (5.0, 1), (1e4, 0)])
 def test_cpo_cases_move_the_cost_as_they_should(violation, case):
     actor, batch = make_case(1)

@@ -11,6 +11,7 @@ from torchrl.objectives.value import GAE
 
 from safe_rl.algorithms import CPOStep, MinibatchUpdate, TRPOStep
 from safe_rl.objectives import CostGAE, CPOLoss, TRPOLoss, VectorGAE, normalise_advantages
+from safe_rl.objectives.surrogate import effective_sample_size
 
 N, T = 3, 20
 SETTINGS = {"gamma": 0.97, "lmbda": 0.9, "value_target": "lambda_return"}
@@ -122,3 +123,9 @@ def test_updates(kind, key):
         results.append(([p.detach().clone() for p in actor.parameters()], metrics["kl"], ess))
     torch.testing.assert_close(results[0], results[1])
     assert results[0][1] > 0
+
+
+def test_padding_has_no_weight_in_the_effective_sample_size():
+    weights, mask = torch.tensor([1.0, 3.0, 100.0]), torch.tensor([True, True, False])
+    share = effective_sample_size(weights.log(), mask)  # (1 + 3)² / (1² + 3²) of two samples
+    assert share.item() == pytest.approx(0.8)

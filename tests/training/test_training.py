@@ -6,7 +6,7 @@ from statistics import fmean
 
 import pytest
 from point_mass_runs import point_mass_trainer
-from run_configs import assert_resumes_exactly
+from run_configs import assert_resumes_exactly, without_times
 
 import safe_rl
 from safe_rl.algorithms import PolicyUpdate
@@ -49,6 +49,15 @@ def test_ppo_lagrangian_keeps_a_limit_of_the_benchmark_and_still_reaches_goals(t
     run = safe_rl.train("PointGoal1", algo="ppo_lagrangian", **settings)
     assert run.final["episode_return"] > 6
     assert run.final["episode_cost"] < 30
+
+
+def test_the_same_seed_gives_the_same_table_and_another_one_does_not(tmp_path):
+    tables = {}
+    for name, seed in (("first", 0), ("again", 0), ("other", 1)):
+        train(tmp_path / name, "frames=200", f"seed={seed}")
+        tables[name] = without_times(tmp_path / name / "progress.csv")
+    assert tables["first"] == tables["again"] != tables["other"]
+    assert read_table(tmp_path / "first" / "progress.csv")["steps"] == [160, 320]  # whole batches
 
 
 def test_a_resumed_run_continues_as_if_it_had_never_stopped(tmp_path):
